@@ -17,6 +17,7 @@ from torchelev.errors import require
 from torchelev.files.config_files import from_json, read_settings, without_header, write_settings
 from torchelev.grid import GridConfig
 from torchelev.layers import LAYERS
+from torchelev.levels.config import LevelsConfig
 from torchelev.stages.age.config import AgingConfig
 from torchelev.stages.compensate.config import DriftConfig
 from torchelev.stages.fusion.config import FusionConfig
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
 class ElevationMapConfig:
     """Configuration of all stages of a map.
 
-    `drift`, `raycast`, `overlap`, `traversability`, `completion` and `fusion.edges` can be None, which switches that
+    `drift`, `raycast`, `overlap`, `traversability`, `completion`, `levels` and `fusion.edges` can be None, which switches that
     stage off.
 
     Raises:
@@ -60,6 +61,7 @@ class ElevationMapConfig:
     )
     #: the layers `completed` and `completed_std`: predicted ground where no sensor saw it; None: none
     completion: CompletionConfig | None = None
+    levels: LevelsConfig | None = None  #: surfaces of a cell besides the ground, such as ceilings; None: none
     filters: tuple[FilterConfig, ...] = ()  #: further layers, computed when they are read: see `torchelev.filters`
     #: what each cell holds besides its height, by name: `ChannelConfig`, or the word of a kind with its defaults
     channels: Mapping[str, Any] = field(default_factory=ChannelConfigs)
@@ -106,6 +108,8 @@ class ElevationMapConfig:
         values = dataclasses.asdict(dataclasses.replace(self, filters=()))
         channels = dict(values.pop("channels"))
         values |= {"channels": channels} if channels else {}
+        if values["levels"] is None:  # files of maps without are read by versions that know none
+            del values["levels"]
         return values | {"filters": [step.to_dict() for step in self.filters]}
 
     @classmethod

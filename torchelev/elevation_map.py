@@ -93,7 +93,9 @@ class ElevationMap(RestartableMap):
         self.update_times = UpdateTimes()
         self._links = cfg.sensor.links
         # Compiled stages are shared by maps of equal ones.
-        self._update_cfg = dataclasses.replace(cfg, completion=None, filters=(), channels=ChannelConfigs())
+        self._update_cfg = dataclasses.replace(cfg, completion=None, filters=(), channels=ChannelConfigs(), levels=None)
+        if self.levels is not None:  # which choose the floor, and keep the others
+            self._update_cfg = dataclasses.replace(self._update_cfg, overlap=None)
         self._only_by_tensors = pipeline.only_by_tensors(cfg)
         self._key = pipeline.register_stages(self._update_cfg)
         self._history = InputHistory()
@@ -163,7 +165,10 @@ class ElevationMap(RestartableMap):
         before = self._take_out_predictions()
         # A seventh faster than `no_grad`, as views need no bookkeeping; the buffers stay normal tensors.
         with torch.inference_mode():
-            self._run_stages(state, inputs, weights)
+            measured = inputs if self.levels is None else self.levels.sort_points(state, inputs, self._recenter)
+            self._run_stages(state, measured, weights)
+            if self.levels is not None:
+                self.levels.follow_drift(state)
         if before is not None:
             with torch.no_grad():
                 write(state, self._write_back(before, state))
@@ -181,6 +186,10 @@ class ElevationMap(RestartableMap):
         if name == "CPU" and weights is None:
             return run(state, inputs)  # chunks would save no memory: C++ keeps one map's for each thread
         return run_in_chunks(run, state, inputs, self.chunks)
+
+    def _recenter(self, state: MapState, inputs: Inputs) -> None:
+        """Move the windows of a state as an update with these inputs does."""
+        pipeline.recenter_in_place(state, inputs, self._update_cfg, self._key if self.backend.name == "CPU" else -1)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore a copy or an unpickled map, whose process may know its config by another key."""

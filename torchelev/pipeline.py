@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -125,6 +126,16 @@ def update_in_place(
         cpu_update.run(key, tensors, values)
     if isinstance(cfg.traversability, LearnedTraversabilityConfig):
         write(stored, rate_learned(stored, cfg, weights))
+
+
+def recenter_in_place(stored: MapState, inputs: Inputs, cfg: ElevationMapConfig, key: int) -> None:
+    """Move the windows as an update would, in place; `key` is that of `register_stages`, or -1 for tensors."""
+    no_points = inputs._replace(points=inputs.points[:, :, :0], variance=None, T_base_links=None)
+    if key < 0:
+        m = measure(*no_points, cfg.grid, dataclasses.replace(cfg.sensor, body=None), stored.elevation.dtype)
+        return write(stored, recenter(stored, m, cfg.grid))
+    values = as_inputs(no_points._asdict() | {"own": None})
+    cpu_update.compiled_stages(key).run((*stored[:-1], *stored.statistics), values, ("measure", "recenter"))
 
 
 @functools.lru_cache(maxsize=64)

@@ -23,7 +23,7 @@ class Statistics(NamedTuple):
     rejected_invalid: Int[Tensor, "B"]  #: NaN or inf
     rejected_range: Int[Tensor, "B"]  #: nearer or farther than the sensor measures
     rejected_body: Int[Tensor, "B"]  #: on the robot itself
-    rejected_overhang: Int[Tensor, "B"]  #: above the exclusion ramp
+    rejected_overhang: Int[Tensor, "B"]  #: above the exclusion ramp, or on another surface than the ground
     rejected_outside: Int[Tensor, "B"]  #: not over the window
     rejected_outlier: Int[Tensor, "B"]  #: outside the Mahalanobis gate
     rejected_edge: Int[Tensor, "B"]  #: on the wrong side of a step within their cell

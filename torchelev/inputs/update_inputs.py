@@ -33,6 +33,7 @@ class Inputs(NamedTuple):
     T_base_links: Float[Tensor, "B K 4 4"] | None  #: poses of the links of `sensor.body`; None: it has none
     pose_covariance: Float[Tensor, "B S 6 6"] | None = None  #: of each sensor's pose; None: poses are exact
     moving: Bool[Tensor, "B"] | None = None  #: environments whose height may drift; None: all
+    aside: Bool[Tensor, "B S N"] | None = None  #: points of other surfaces than the ground; None: there are none
 
 
 class TakesInputs(Protocol[_ResultOut]):

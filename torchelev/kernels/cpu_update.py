@@ -32,6 +32,7 @@ class Inputs(NamedTuple):
     own: Bool[Tensor, "B S N"] | None  #: points on the robot's links
     pose_covariance: Float[Tensor, "B S 6 6"] | None  #: of each sensor's pose
     moving: Bool[Tensor, "B"] | None  #: environments whose height may drift
+    aside: Bool[Tensor, "B S N"] | None  #: points of other surfaces than the ground
 
 
 class Sizes(ctypes.Structure):
@@ -159,6 +160,6 @@ def as_inputs(values: Mapping[str, Tensor | None]) -> Inputs:
 
 
 _KINDS = {
-    name: torch.bool if name in ("own", "moving") else torch.float64 if name.startswith("T_") else torch.float32
+    name: torch.bool if name in ("own", "moving", "aside") else torch.float64 if name.startswith("T_") else torch.float32
     for name in Inputs._fields
 }

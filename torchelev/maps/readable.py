@@ -12,6 +12,8 @@ from torchelev.config import ElevationMapConfig
 from torchelev.errors import require
 from torchelev.inputs import checks
 from torchelev.layers import LAYERS, MODES, Layer, sample_layer
+from torchelev.levels import views
+from torchelev.levels.module import MapLevels
 from torchelev.maps.buffers import MapBuffers
 from torchelev.stages.complete import (
     COMPLETED,
@@ -63,6 +65,9 @@ class ReadableMap(MapBuffers):
             self.channels = None
             if cfg.channels:
                 self.channels = Channels(cfg.channels, cfg.grid, cfg.sensor, num_envs, device)
+            self.levels = None
+            if cfg.levels is not None and cfg.levels.others:
+                self.levels = MapLevels(cfg, num_envs, device)
         for net in (self.head, self.completion_net):
             if net is not None:
                 net.to(device)
@@ -108,9 +113,10 @@ class ReadableMap(MapBuffers):
     @property
     def _own_layers(self) -> tuple[str, ...]:
         channels = () if self.channels is None else self.channels.layers
-        return (*LAYERS, *(() if self.completion_net is None else COMPLETED), *channels)
+        levels = () if self.levels is None else views.LAYERS
+        return (*LAYERS, *(() if self.completion_net is None else COMPLETED), *levels, *channels)
 
-    def layer(self, name: str, *, state: MapState | None = None) -> Float[Tensor, "B H W"]:
+    def layer(self, name: str, *, state: MapState | None = None, level: int | None = None) -> Float[Tensor, "B H W"]:
         """Return a layer as a fresh tensor, NaN where unknown.
 
         - elevation [m], variance [m^2], time [s] since the last hit: unknown where never measured, or cleared.
@@ -125,20 +131,35 @@ class ReadableMap(MapBuffers):
           state and in the weights of `completion_net`.
         - a channel's, or `<channel>.<component>` of one with several, such as "rgb.red". The channel of several
           components itself is (B, C, H, W). Unknown where no point, and no image, said anything of the ground.
+        - ceiling [m], with `LevelsConfig`: the underside of the lowest surface above the ground, inf where rays met none,
+          NaN where nobody looked; clearance [m]: its height above the ground.
         - a configured filter's: computed when read, with the layers that it needs, and kept until the map changes.
 
         Args:
             name: one of `layers`, or a channel.
             state: state to read; None: the map's own.
+            level: read a surface's own elevation, underside, variance, time or validity: 0 is the lowest of each cell,
+                k the one with k surfaces below it. None: the ground, on which the robot stands.
 
         Raises:
             KeyError: if there is no such layer.
+            ValueError: if there is no such level.
         """
+        if level is not None:
+            values, known = self.read_level(name, level, state)
+            return torch.where(known, values, torch.nan)
         if name in self.cfg.channels and name not in self.layers:
             vectors, known = self.read_channel(name, state)
             return torch.where(known[..., None], vectors, torch.nan).movedim(-1, 1)
         values, known = self.read_layer(name, state)
         return torch.where(known, values, torch.nan)
+
+    def read_level(self, name: str, level: int, state: MapState | None = None) -> Layer:
+        """Return a layer of one surface of each cell, and where there is one; arguments and errors as of `layer`."""
+        hint = "give the config levels=LevelsConfig(max_levels=3)"
+        require(self.levels is not None, "level", "needs a map with levels", repr(level), hint)
+        assert self.levels is not None
+        return views.by_level(name, level, self.levels.view(self.state if state is None else state))
 
     def read_channel(
         self, name: str, state: MapState | None = None, cell: Int[Tensor, "B M"] | None = None
@@ -174,7 +195,9 @@ class ReadableMap(MapBuffers):
         self._sync_channels()
 
     def _sync_channels(self) -> None:
-        """Make channels follow what changed besides updates, such as cells that were forgotten."""
+        """Make channels and levels follow what changed besides updates, such as cells that were forgotten."""
+        if self.levels is not None:
+            self.levels.follow(self.state)
         if self.channels is not None:
             self.channels.follow(self.state)
 
@@ -194,15 +217,27 @@ class ReadableMap(MapBuffers):
 
     def _read_own(self, name: str, state: MapState | None) -> Layer:
         """Return a layer that no filter makes."""
-        hint = "give the config a CompletionConfig" if name in COMPLETED else f"there are {', '.join(self.layers)}"
+        hint = self._hint_of(name)
         require(name in self._own_layers, "layer", "must be a layer's name", repr(name), hint, KeyError)
         if name in COMPLETED:
             return self._complete(state)[name]
+        if name in views.LAYERS:
+            assert self.levels is not None and self.cfg.levels is not None
+            surfaces = self.levels.view(self.state if state is None else state)
+            return getattr(views, name)(surfaces, self.cfg.levels.min_gap)  # type: ignore[no-any-return]
         if name not in LAYERS:
             channel = name.split(".")[0]
             values, known = self.read_channel(channel, state)
             return values[..., self.cfg.channels[channel].components(channel).index(name)], known
         return LAYERS[name](self.state if state is None else state)
+
+    def _hint_of(self, name: str) -> str:
+        """Return what to do about a layer that is not there."""
+        if name in COMPLETED:
+            return "give the config a CompletionConfig"
+        if name in views.LAYERS:
+            return "give the config levels=LevelsConfig(max_levels=3)"
+        return f"there are {', '.join(self.layers)}"
 
     def _complete(self, state: MapState | None = None) -> dict[str, Layer]:
         """Return the completed layers of a state; those of the map's own state are kept until it changes."""

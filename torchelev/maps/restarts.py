@@ -46,8 +46,9 @@ class RestartableMap(PaintedMap, ReadableMap):
         self.num_resets.add_(self._choose(env_ids, mask))
         with torch.no_grad():
             forget(self.state, self.cfg.grid, env_ids, mask)
-        if self.channels is not None:
-            self.channels.forget(env_ids, mask)
+        for part in (self.channels, self.levels):
+            if part is not None:
+                part.forget(env_ids, mask)
 
     def _check_choice(self, env_ids: Tensor | None, mask: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
         require(env_ids is None or mask is None, "env_ids, mask", "exclude each other", "both", "give one of them")
@@ -96,6 +97,8 @@ class RestartableMap(PaintedMap, ReadableMap):
         require_positive(radius=radius)
         away = self.cell_centers() - center[:, None, None].double()
         cells = torch.linalg.vector_norm(away, dim=-1) <= radius
+        if self.levels is not None:
+            self.levels.forget_cells(self.state, cells)
         self._revise(lambda state: forget_cells(state, cells))
 
     def _revise(self, change: Callable[[MapState], MapState]) -> None:

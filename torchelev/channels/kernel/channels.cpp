@@ -6,7 +6,7 @@
 #include <vector>
 
 #include "channels/kernel/equation.h"
-#include "channels/kernel/places.h"
+#include "channels/kernel/inputs.h"
 #include "kernels/threads.h"
 
 namespace {
@@ -189,6 +189,7 @@ class Map {
         for (int64_t n = 0; n < number; n++) x[n] = p[3 * n], y[n] = p[3 * n + 1], z[n] = p[3 * n + 2];
         for (int64_t n = 0; n < BLOCK; n++)
             frame.place(x[n], y[n], z[n], ax[n], ay[n], az[n], cell[n], share[n]);
+        for (int64_t n = 0; n < BLOCK; n++) share[n] = channels::POINT / share[n];
         for (int64_t n = 0; variance && n < number; n++) {
             const bool is_sound = variance[n] >= TINY && variance[n] < INFINITE;
             share[n] = channels::POINT / variance[n], cell[n] = is_sound ? cell[n] : -1;

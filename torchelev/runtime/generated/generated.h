@@ -98,6 +98,7 @@ struct Inputs {
     uint8_t* own;
     float* pose_covariance;
     uint8_t* moving;
+    uint8_t* aside;
     Inputs at(int64_t b, const Sizes& n) const {
         Inputs one = *this;
         if (points) one.points += b * n.S * n.N * 3;
@@ -109,6 +110,7 @@ struct Inputs {
         if (own) one.own += b * n.S * n.N;
         if (pose_covariance) one.pose_covariance += b * n.S * 6 * 6;
         if (moving) one.moving += b * 1;
+        if (aside) one.aside += b * n.S * n.N;
         return one;
     }
 };

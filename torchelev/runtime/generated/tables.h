@@ -76,6 +76,7 @@ constexpr Setting SETTINGS[] = {
     {"traversability.critical_roughness", NUMBER, false, false, {0.05}},
     {"traversability.robot", IGNORED, true, true, {}},
     {"completion", ONLY_PYTHON, true, true, {}},
+    {"levels", ONLY_PYTHON, true, true, {}},
     {"filters", CHAIN, false, false, {}},
     {"channels", ONLY_PYTHON, false, false, {}},
 };

@@ -69,7 +69,8 @@ struct Sensor {
         const Vector<Lanes> relative = measurement::rotate<Lanes>(R, p.x, p.y, p.z);
         const Vector<Lanes> at{relative.x + origin[0], relative.y + origin[1], relative.z + origin[2]};
         const Flags casts = in_range & ~own(n, count, at);
-        const Flags used = s.has_ramp ? casts & ~measurement::above_ramp(relative, s) : casts;
+        Flags used = s.has_ramp ? casts & ~measurement::above_ramp(relative, s) : casts;
+        if (u.inputs.aside) used &= load_bytes(u.inputs.aside + n, count) == 0;
         const Lanes noise = u.inputs.variance ? pick(finite, given, splat(1)) : measurement::noise_of(d2, s);
         store(&m.x[n], at.x, count), store(&m.y[n], at.y, count), store(&m.z[n], at.z, count);
         store(&m.noise[n], noise, count);

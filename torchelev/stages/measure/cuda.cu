@@ -76,6 +76,7 @@ extern "C" __global__ void measure_points(Update u) {
             own = measurement::inside_body(
                 turn(in.T_map_base, true, p.x - to.base[0], p.y - to.base[1], p.z - to.base[2]), s);
         casts = in_range && !own, used = casts && !(s.has_ramp && measurement::above_ramp(relative, s));
+        used = used && !(in.aside && in.aside[k]);
         to.x[k] = p.x, to.y[k] = p.y, to.z[k] = p.z;
         to.noise[k] = !in.variance ? measurement::noise_of(d2, s) : finite ? given : 1.0f;
         to.of_pose[k] = !in.pose_covariance ? 0

@@ -130,10 +130,11 @@ def gate_points(
     T_map_base: Tensor | None,
     base: Tensor | None,
     own: Bool[Tensor, "B S N"] | None,
+    aside: Bool[Tensor, "B S N"] | None,
     cfg: SensorConfig,
     resolution: float,
 ) -> Gates:
-    """Leave out points on the robot's body and above the ramp; set sigma_p^2 = alpha_d d^2 + noise_floor."""
+    """Leave out points on the robot's body, above the ramp and on other surfaces; set sigma_p^2 = alpha_d d^2 + noise_floor."""
     relative, position = mapped.relative.transpose(1, 2), mapped.position.transpose(1, 2)
     if variance is None:
         noise = cfg.noise_factor * sensed.distance2 + cfg.noise_floor
@@ -148,6 +149,8 @@ def gate_points(
     if cfg.exclusion is not None:
         place = from_ramp(position, relative, base, cfg.depth, resolution)
         overhang = mapped.in_range & ~body & above_ramp(place, cfg.exclusion)
+    if aside is not None:
+        overhang = overhang | (mapped.in_range & ~body & aside.flatten(1))
     return Gates(variance, mapped.in_range & ~body & ~overhang, mapped.in_range & ~body)
 
 
@@ -170,6 +173,7 @@ def measure(
     T_base_links: Float[Tensor, "B K 4 4"] | None,
     pose_covariance: Float[Tensor, "B S 6 6"] | None,
     moving: Bool[Tensor, "B"] | None,
+    aside: Bool[Tensor, "B S N"] | None,
     grid: GridConfig,
     cfg: SensorConfig,
     dtype: torch.dtype,
@@ -177,7 +181,7 @@ def measure(
     """Turn sensor-frame points into a measurement (paper, Sec. II-A "transform" and II-C).
 
     Noise: sigma_p^2 = alpha_d * d^2 + noise_floor with d the distance from the sensor, or the caller's variances.
-    Gates: not finite, distance, the robot's body, exclusion ramp. Rejected points have used = False. A point counts as
+    Gates: not finite, distance, the robot's body, exclusion ramp, other surfaces (`aside`). Rejected points have used = False. A point counts as
     not finite if its variance has no finite inverse, or if a pose of its environment is not finite or beyond FARTHEST.
     """
     sound, T_map_sensor, T_map_base, T_base_links = sound_poses(T_map_sensor, T_map_base, T_base_links)
@@ -191,7 +195,7 @@ def measure(
     own = None
     if isinstance(cfg.body, RobotBody) and T_map_base is not None and T_base_links is not None:
         own = on_links(sensed, T_map_sensor, T_map_base, T_base_links, cfg.body)
-    gates = gate_points(sensed, mapped, variance, T_map_base, base, own, cfg, grid.resolution)
+    gates = gate_points(sensed, mapped, variance, T_map_base, base, own, aside, cfg, grid.resolution)
     total, noise, of_position = gates.variance, None, None
     if pose_covariance is not None:
         total, noise = gates.variance + project_covariance(mapped.relative, pose_covariance, dtype), gates.variance

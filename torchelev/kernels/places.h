@@ -1,4 +1,5 @@
-// What an update brings, and where its points lie: native.py, and stages/measure of the maps.
+// Where the points of an update lie in the window: stages/measure of the maps, for what follows their updates. `Update`
+// has the inputs of one, and the corners of the windows.
 #pragma once
 
 #include <algorithm>
@@ -6,43 +7,10 @@
 #include <cstdint>
 #include <limits>
 
-#include "channels/kernel/equation.h"
-
-namespace channels {
+namespace places {
 
 constexpr int64_t FAR = int64_t(1) << 22;  // [cells] whole numbers up to it fit a float
 constexpr float INFINITE = std::numeric_limits<float>::infinity(), TINY = std::numeric_limits<float>::min();
-
-// `_Channel` of native.py.
-struct Channel {
-    float *values, *weight, *age;  // (B, H, W, C), (B, H, W), (B, H, W) or null
-    const float* features;         // (B, M, C), null if the update brings none
-    int64_t C;
-    int32_t kind;
-    float rate, half_life, max_age, tolerance;  // half_life: infinite for none
-};
-
-// `_Update` of native.py.
-struct Update {
-    const float* points;          // (B, S, N, 3) [m] sensor frame
-    const double* T_map_sensor;   // (B, S, 4, 4)
-    const double* T_map_base;     // (B, 4, 4), or null
-    const float* variance;        // (B, S, N) [m^2], or null
-    const uint8_t* own;           // (B, S, N) points on the robot's links, or null
-    const float *dt, *drift;      // (B) [s], (B) [m] or null
-    const int64_t* corner_now;    // (B, 2)
-    const float* elevation;       // (B, H, W) [m]
-    const uint8_t* validity;      // (B, H, W)
-    int64_t* corner;              // (B, 2)
-    float* height;                // (B, H, W) [m]
-    const Channel* channels;      // (K)
-    int64_t B, S, N, H, W, K;
-    double resolution;
-    float noise_factor, noise_floor, min_distance, max_distance;  // of the sensor [m]
-    float box[6];                 // [m] lower and upper corner of the robot's box, base frame
-    float ramp[4];                // slope, distance [m], offset [m] and height [m] of the exclusion ramp
-    int32_t has_box, has_ramp;
-};
 
 // Where the points of an update count from, as in `measure`: the cell below the base, or below the first sensor.
 struct Origin {
@@ -50,7 +18,7 @@ struct Origin {
     float base[3], to_base[9];  // [m] from the anchor's corner; rows of the inverse rotation
     bool has_base, is_sound = true;
 
-    Origin(const Update& u, int64_t b) : base{}, to_base{}, has_base(u.T_map_base) {
+    template <class Update> Origin(const Update& u, int64_t b) : base{}, to_base{}, has_base(u.T_map_base) {
         const double* T = has_base ? u.T_map_base + 16 * b : u.T_map_sensor + 16 * b * u.S;
         for (int n = 0; n < 12; n++) is_sound &= std::isfinite(T[n]);
         for (int axis = 0; axis < 2; axis++)
@@ -72,7 +40,7 @@ struct Frame {
     int32_t width;
     Origin origin;
 
-    Frame(const Update& u, int64_t b, const double* T, const Origin& origin)
+    template <class Update> Frame(const Update& u, int64_t b, const double* T, const Origin& origin)
         : resolution(float(u.resolution)), H(float(u.H)), W(float(u.W)), noise_factor(u.noise_factor),
           noise_floor(u.noise_floor), nearest2(u.min_distance * u.min_distance),
           farthest2(u.max_distance * u.max_distance), width(int32_t(u.W)), origin(origin) {
@@ -84,8 +52,8 @@ struct Frame {
             first[axis] = float(std::clamp(origin.anchor[axis] - u.corner[2 * b + axis], -FAR, FAR));
     }
 
-    // Find the place of a point [m], its cell, -1 out of the window, and POINT / sigma^2.
-    void place(float x, float y, float z, float& ax, float& ay, float& az, int32_t& cell, float& weight) const {
+    // Find the place of a point [m], its cell, -1 out of the window, and sigma^2 [m^2].
+    void place(float x, float y, float z, float& ax, float& ay, float& az, int32_t& cell, float& noise) const {
         const float d2 = x * x + y * y + z * z;
         ax = R[0] * x + R[1] * y + R[2] * z + t[0];
         ay = R[3] * x + R[4] * y + R[5] * z + t[1];
@@ -94,7 +62,7 @@ struct Frame {
         const float i = std::floor(ax / resolution) + first[0], j = std::floor(ay / resolution) + first[1];
         const bool inside = (d2 >= nearest2) & (d2 <= farthest2) & (d2 < INFINITE) & (i >= 0) & (i < H) & (j >= 0) & (j < W);
         cell = inside ? int32_t(inside ? i : 0) * width + int32_t(inside ? j : 0) : -1;
-        weight = POINT / (noise_factor * d2 + noise_floor);
+        noise = noise_factor * d2 + noise_floor;
     }
 
     // Return whether a place [m] lies above the exclusion ramp: `above_ramp`.
@@ -117,4 +85,4 @@ struct Frame {
     }
 };
 
-}  // namespace channels
+}  // namespace places

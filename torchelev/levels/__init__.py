@@ -1,0 +1,1 @@
+"""More than one height per cell: ceilings, tables, bridges and floors above each other. Reading them: `views`."""

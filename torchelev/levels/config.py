@@ -1,0 +1,52 @@
+"""How many surfaces a cell holds, and what tells them apart."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from torchelev.errors import require, require_positive
+from torchelev.grid import GridConfig
+
+MAX_LEVELS = 8  # a cell of more is a bush
+SEPARATIONS = ("rays", "gap")
+
+
+@dataclass(frozen=True, kw_only=True)
+class LevelsConfig:
+    """Several surfaces in each cell: the ground on which the robot stands, and those above and below it.
+
+    Raises:
+        ValueError: if a setting is out of range.
+    """
+
+    max_levels: int = 3  #: K surfaces of a cell, the ground included, 1 to 8; 1: the ground alone
+    #: [m] free height between two surfaces; a smaller space counts as solid. Give the least that the robot fits through
+    min_gap: float = 0.4
+    #: what shows that the space between two surfaces is free: "rays" that pass through it, or the "gap" alone
+    separation: str = "rays"
+    max_step: float = 0.3  #: [m] that the robot can step up or down from a cell to the next
+    max_blind: float = 1.0  #: [m] of unknown cells over which the ground is taken to go on
+    min_support: float = 3.0  #: points that a surface needs to be reported, or chosen as the ground
+
+    def __post_init__(self) -> None:
+        K, rule = self.max_levels, f"must be a whole number from 1 to {MAX_LEVELS}"
+        is_count = isinstance(K, int) and not isinstance(K, bool) and 1 <= K <= MAX_LEVELS
+        hint = "3 hold ground, table and ceiling; each more costs time and 20 bytes a cell"
+        require(is_count, "levels.max_levels", rule, repr(K), hint)
+        require_positive(**{"levels.min_gap": self.min_gap, "levels.max_step": self.max_step})
+        known, rule = self.separation in SEPARATIONS, f"must be one of {', '.join(SEPARATIONS)}"
+        require(known, "levels.separation", rule, repr(self.separation), "use rays")
+        for name in ("max_blind", "min_support"):
+            value = getattr(self, name)
+            good = 0 <= value < math.inf
+            require(good, f"levels.{name}", "must be finite and not negative", value, "leave it out for the default")
+
+    def blind_cells(self, grid: GridConfig) -> int:
+        """Return `max_blind` in cells."""
+        return int(min(self.max_blind, 1e3) / grid.resolution)
+
+    @property
+    def others(self) -> int:
+        """How many surfaces a cell holds besides the ground, L = K - 1."""
+        return self.max_levels - 1

@@ -1,0 +1,140 @@
+"""Which surface of each cell is the ground: the one on the shortest way from where the robot stands."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchelev.grid import GridConfig
+from torchelev.levels.config import LevelsConfig
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+
+SLOPE = 0.5  # by which unknown ground may rise
+NONE = -1
+
+
+class Standing(NamedTuple):
+    """The surface that a robot stands on: the one next to its base, from above, among those below the base."""
+
+    cell: Int[Tensor, "B"]  #: flat number
+    surface: Int[Tensor, "B"]  #: 0 the ground, k the level k - 1
+    height: Float[Tensor, "B"]  #: [m]
+    found: Bool[Tensor, "B"]  #: there is one in the window
+
+
+def find_standing(
+    heights: Float[Tensor, "B K H W"], known: Bool[Tensor, "B K H W"], base: Tensor, square: Tensor
+) -> Standing:
+    """Find the highest surface below the base in the cell nearest to it that has one.
+
+    Args:
+        heights: of all surfaces [m].
+        known: which of them exist.
+        base: (B, 3) [m]; NaN: none is found.
+        square: squared distance of each cell from the base (B, H, W) [m^2].
+    """
+    below = known & (heights <= base[:, 2, None, None, None])
+    top, surface = torch.where(below, heights, -torch.inf).max(1)
+    far = torch.where(top > -torch.inf, square, torch.inf).flatten(1)
+    nearest, cell = far.min(1)
+    at = cell[:, None]
+    height, found = top.flatten(1).gather(1, at)[:, 0], nearest < torch.inf
+    return Standing(cell, surface.flatten(1).gather(1, at)[:, 0], torch.where(found, height, 0.0), found)
+
+
+class _Wave(NamedTuple):
+    """What the last step reached: K surfaces, and the guessed ground of cells where none is known."""
+
+    reached: Bool[Tensor, "B K+1 H W"]
+    height: Float[Tensor, "B K+1 H W"]
+    blind: Int[Tensor, "B K+1 H W"]  # cells since the last surface
+
+
+def _beside(value: Tensor, axis: int, step: int, blank: float) -> Tensor:
+    """Return each cell's neighbour along an axis; beyond the window it is blank."""
+    rim = torch.full_like(value.narrow(axis, 0, 1), blank)
+    size = value.shape[axis]
+    if step > 0:
+        return torch.cat([value.narrow(axis, 1, size - 1), rim], axis)
+    return torch.cat([rim, value.narrow(axis, 0, size - 1)], axis)
+
+
+def choose_ground(
+    heights: Float[Tensor, "B K H W"],
+    known: Bool[Tensor, "B K H W"],
+    standing: Standing,
+    grid: GridConfig,
+    cfg: LevelsConfig,
+    is_readable: bool,
+) -> tuple[Int[Tensor, "B H W"], Bool[Tensor, "B H W"]]:
+    """Find the surface that each cell is first reached on, from cell to cell by steps of at most `max_step`.
+
+    Ground that is not known is guessed to go on as it was, over at most `max_blind`; to surfaces beyond it, `SLOPE`
+    adds to the step. All steps of a number come before those of the next, so the way is the shortest.
+
+    Args:
+        heights: of the ground and the other surfaces [m].
+        known: which of them exist.
+        standing: where the way begins.
+        grid: the window.
+        cfg: `max_step` and `max_blind`.
+        is_readable: whether the host may ask the device if the search is over.
+
+    Returns:
+        Number of the surface, 0 the ground; NONE where only the guess came, or nothing.
+        Whether the ground was reached at all.
+    """
+    B, K, H, W = heights.shape
+    at = torch.zeros(B, K + 1, H * W, dtype=torch.bool, device=heights.device)
+    at[torch.arange(B), standing.surface, standing.cell] = standing.found
+    at = at.unflatten(2, (H, W))
+    blind_limit = cfg.blind_cells(grid)
+    all_heights = torch.cat([heights, torch.zeros_like(heights[:, :1])], 1)
+    wave = _Wave(at, all_heights, torch.zeros_like(all_heights, dtype=torch.int64))
+    done, first = at, _first_of(at, torch.full((B, H, W), NONE, device=at.device), at.any(1))
+    decided = at.any(1)
+    for _ in range(H + W):
+        surfaces, guess, guess_blind = _step(wave, heights, known, grid, cfg, blind_limit)
+        new = torch.cat([surfaces, (guess < torch.inf)[:, None] & ~known[:, :1]], 1) & ~done
+        if is_readable and not bool(new.any()):
+            break
+        first = _first_of(new, first, ~decided)
+        decided, done = decided | new.any(1), done | new
+        guessed = torch.where(guess < torch.inf, guess, 0.0)[:, None]
+        blind = torch.zeros_like(wave.blind)
+        blind[:, K] = guess_blind
+        wave = _Wave(new, torch.cat([heights, guessed], 1), blind)
+    return first, done[:, 0]
+
+
+def _first_of(new: Tensor, first: Tensor, open_: Tensor) -> Int[Tensor, "B H W"]:
+    """Return the surface that cells were reached on first; of several at once the ground, then the first place."""
+    K = new.shape[1] - 1
+    surface = torch.where(new[:, :K].any(1), new[:, :K].to(torch.int64).argmax(1), NONE)
+    return torch.where(open_ & new.any(1), surface, first)
+
+
+def _step(
+    wave: _Wave, heights: Tensor, known: Tensor, grid: GridConfig, cfg: LevelsConfig, blind_limit: int
+) -> tuple[Bool[Tensor, "B K H W"], Float[Tensor, "B H W"], Int[Tensor, "B H W"]]:
+    """Return which surfaces one step reaches, and the guess where the ground is not known: its height, inf for none."""
+    reached = torch.zeros_like(known)
+    guess = torch.full_like(heights[:, 0], torch.inf)
+    count = torch.zeros_like(guess, dtype=torch.int64)
+    for axis, step in ((1, 1), (1, -1), (2, 1), (2, -1)):
+        for k in range(wave.reached.shape[1]):
+            comes = _beside(wave.reached[:, k].to(heights.dtype), axis, step, 0.0) > 0
+            height = _beside(wave.height[:, k], axis, step, 0.0)
+            blind = _beside(wave.blind[:, k], axis, step, 0)
+            limit = cfg.max_step + (SLOPE * grid.resolution) * blind.to(heights.dtype)
+            reached = reached | (comes & ((heights.movedim(1, 0) - height).abs() <= limit)).movedim(0, 1)
+            goes_on = comes & (blind < blind_limit)
+            is_lower = goes_on & (height < guess)
+            is_same = goes_on & (height == guess)
+            count = torch.where(is_lower, blind + 1, torch.where(is_same, torch.minimum(count, blind + 1), count))
+            guess = torch.where(is_lower, height, guess)
+    return reached & known, guess, count

@@ -1,0 +1,453 @@
+// What an update does to levels: step.py, for float32 maps on a CPU.
+
+#include <numeric>
+
+#include "kernels/threads.h"
+#include "levels/kernel/ground.h"
+#include "levels/kernel/rays.h"
+#include "levels/kernel/surfaces.h"
+#include "levels/kernel/update.h"
+
+namespace {
+
+using levels::Cell, levels::Found, levels::INFINITE, levels::Points, levels::Update, places::TINY;
+constexpr int64_t BLOCK = 64;
+constexpr float SAME = 0.1f;
+
+// Memory of a thread, kept between updates.
+struct Scratch {
+    Points points;
+    std::vector<levels::Sight> sights;
+    std::vector<float> x, y, highest, lowest;  // centres of the cells [m], rays over them [m]
+    std::vector<float> bottom, top;            // (H W) [m] of the scan's points
+    std::vector<int32_t> number, list;         // (H W) of the scan's points; place in `complex`, -1 for none
+    std::vector<uint8_t> all_above, changed;   // (H W)
+    std::vector<int32_t> touched, complex, first, sorted;
+    levels::Search search;
+};
+
+// A cluster of points: clusters.py.
+struct Cluster {
+    float lower, upper, weight = 0, lift = 0, number = 0;
+    bool above = true;
+    int64_t begin, end;  // among the sorted points
+
+    Found found(float variance_floor) const {
+        const float mean = lower + lift / (weight > 0 ? weight : 1.0f);
+        return {lower, upper, mean, std::max(1 / weight, variance_floor), number / weight, number};
+    }
+};
+
+// The levels of one map in an update.
+struct Map {
+    const Update& u;
+    int64_t b;
+    Parts parts;
+    Scratch& own;
+    int64_t cells, M;
+    float g2;  // [m^2] what the disagreement of scans adds to the variance of the ground
+    levels::Sights sights;
+    float base[3] = {}, from_below = -INFINITE;  // [m] lowest height at which points are seen from below
+    bool has_base = false;
+    std::vector<int32_t> row, column;  // places of the window's cells in the ring
+    int64_t statistics[levels::STATISTICS] = {};
+
+    Map(const Update& u, int64_t b, int num_threads, Scratch& own)
+        : u(u), b(b), parts{num_threads, num_threads}, own(own), cells(u.H * u.W), M(u.S * u.N),
+          g2(u.disagreement[b] * u.disagreement[b]), sights{levels::SightGrid(u), own.sights, u.min_gap} {}
+
+    void run() {
+        follow();
+        const places::Origin origin(u, b);
+        own.sights.resize(u.S);
+        measure(origin);
+        look();
+        sort_points();
+        tidy();
+        if (has_base) choose();
+        put_aside();
+        std::copy_n(statistics, levels::STATISTICS, u.statistics + levels::STATISTICS * b);
+    }
+
+    // Places in the ring -------------------------------------------------------------------------------------------
+
+    static int64_t ring(int64_t k, int64_t size) { return ((k % size) + size) % size; }
+    int64_t place(int64_t c) const { return row[c / u.W] + column[c % u.W]; }
+
+    Cell cell_at(int64_t p) const {
+        const int64_t first = b * u.L * cells + p;
+        return {u.lower + first, u.upper + first, u.level_variance + first, u.support + first, u.time + first, u.L, cells};
+    }
+    float& free_top(int64_t p) const { return u.free_top[b * cells + p]; }
+
+    // Move to the window of the map, and age: `move`, `age`.
+    void follow() {
+        const int64_t *now = u.corner + 2 * b, size[] = {u.H, u.W};
+        int64_t* before = u.before + 2 * b;
+        row.resize(u.H), column.resize(u.W);
+        for (int64_t i = 0; i < u.H; i++) row[i] = int32_t(ring(now[0] + i, u.H) * u.W);
+        for (int64_t j = 0; j < u.W; j++) column[j] = int32_t(ring(now[1] + j, u.W));
+        auto enters = [&](int axis, int64_t k) { return now[axis] + k < before[axis] || now[axis] + k >= before[axis] + size[axis]; };
+        for (int64_t i = 0; i < u.H; i++) {
+            const bool all = enters(0, i);
+            for (int64_t j = 0; j < u.W; j++)
+                if (all || enters(1, j)) blank(row[i] + column[j]);
+        }
+        for (int axis = 0; axis < 2; axis++) before[axis] = now[axis];
+        const float dt = u.dt[b] > 0 && u.dt[b] < INFINITE ? u.dt[b] : 0, added = u.variance_rate * dt;
+        const int64_t first = b * u.L * cells;
+        float *support = u.support + first, *time = u.time + first, *variance = u.level_variance + first;
+        for (int64_t p = 0; p < u.L * cells; p++) {
+            const bool is_there = support[p] > 0;
+            time[p] = is_there ? time[p] + dt : time[p];
+            variance[p] = is_there ? std::min(variance[p] + added, u.max_variance) : variance[p];
+        }
+    }
+
+    void blank(int64_t p) const {
+        for (int64_t l = 0; l < u.L; l++) cell_at(p).remove(l);
+        free_top(p) = -INFINITE;
+    }
+
+    // The scan ---------------------------------------------------------------------------------------------------
+
+    void measure(const places::Origin& origin) {
+        own.points.resize(M);
+        bool is_sound = origin.is_sound;
+        for (int64_t k = 0; k < 12 * u.S; k++) is_sound &= std::isfinite(u.T_map_sensor[16 * (b * u.S + k / 12) + k % 12]);
+        has_base = origin.has_base && is_sound;
+        std::copy_n(origin.base, 3, base);
+        for (int64_t s = 0; s < u.S; s++) {
+            const places::Frame frame(u, b, u.T_map_sensor + 16 * (b * u.S + s), origin);
+            std::copy_n(frame.t, 3, own.sights[s].origin);
+            from_below = std::max(from_below, frame.t[2] + 0.5f * u.min_gap);
+            if (!is_sound) {
+                std::fill_n(own.points.cell.begin() + s * u.N, u.N, -1), std::fill_n(own.points.casts.begin() + s * u.N, u.N, 0);
+                continue;
+            }
+            const int64_t blocks = (u.N + BLOCK - 1) / BLOCK;
+            parts(blocks, [&](int64_t, int64_t begin, int64_t end) {
+                for (int64_t k = begin; k < end; k++)
+                    measure_block(s * u.N + k * BLOCK, std::min(BLOCK, u.N - k * BLOCK), frame);
+            });
+        }
+        const int64_t* anchor = origin.anchor;
+        own.x.resize(u.H), own.y.resize(u.W);
+        const int64_t sizes[] = {u.H, u.W};
+        for (int axis = 0; axis < 2; axis++) {
+            const int64_t away = std::clamp(u.corner[2 * b + axis] - anchor[axis], -places::FAR, places::FAR);
+            std::vector<float>& centers = axis ? own.y : own.x;
+            for (int64_t k = 0; k < sizes[axis]; k++)
+                centers[k] = (float(k) + (float(away) + 0.5f)) * float(u.resolution);
+        }
+    }
+
+    void measure_block(int64_t begin, int64_t number, const places::Frame& given) {
+        const places::Frame frame = given;  // a copy that nothing else can change: the loops become vectors
+        const int64_t first = b * M + begin;
+        const float *p = u.points + 3 * first, *variance = u.variance ? u.variance + first : nullptr;
+        const uint8_t* is_own = u.own ? u.own + first : nullptr;
+        float x[BLOCK] = {}, y[BLOCK] = {}, z[BLOCK] = {}, ax[BLOCK], ay[BLOCK], az[BLOCK], noise[BLOCK];
+        int32_t cell[BLOCK];
+        uint8_t casts[BLOCK], above[BLOCK] = {};
+        for (int64_t n = 0; n < number; n++) x[n] = p[3 * n], y[n] = p[3 * n + 1], z[n] = p[3 * n + 2];
+        for (int64_t n = 0; n < BLOCK; n++) {
+            const float d2 = x[n] * x[n] + y[n] * y[n] + z[n] * z[n];
+            casts[n] = (d2 >= frame.nearest2) & (d2 <= frame.farthest2);
+            frame.place(x[n], y[n], z[n], ax[n], ay[n], az[n], cell[n], noise[n]);
+        }
+        for (int64_t n = 0; variance && n < number; n++) {
+            casts[n] &= (variance[n] >= TINY) & (variance[n] < INFINITE);
+            noise[n] = casts[n] ? variance[n] : 1.0f;
+        }
+        for (int64_t n = 0; !u.own && u.has_box && u.T_map_base && n < BLOCK; n++)
+            casts[n] &= !frame.is_inside(ax[n], ay[n], az[n], u.box);
+        for (int64_t n = 0; is_own && n < number; n++) casts[n] &= !is_own[n];
+        for (int64_t n = 0; u.has_ramp && n < BLOCK; n++) above[n] = frame.is_above(ax[n], ay[n], az[n], u.ramp);
+        Points& to = own.points;
+        for (int64_t n = 0; n < number; n++) {
+            const int64_t m = begin + n;
+            to.x[m] = ax[n], to.y[m] = ay[n], to.z[m] = az[n], to.noise[m] = noise[n];
+            to.cell[m] = casts[n] ? cell[n] : -1, to.casts[m] = casts[n], to.above[m] = above[n];
+        }
+    }
+
+    // Make the tables of the rays, and the extremes of the points of each cell.
+    void look() {
+        for_each(int(2 * u.S + 1), parts.num_threads, [&](int task) {
+            if (task == 2 * u.S) return span_cells();
+            levels::Sight& sight = own.sights[task / 2];
+            const int64_t begin = (task / 2) * u.N, end = begin + u.N;
+            if (task % 2) sight.look_for_nearest(own.points, begin, end, sights.size);
+            else sight.look_for_slopes(own.points, begin, end, sights.size);
+        });
+        own.highest.resize(cells), own.lowest.resize(cells);
+        parts(u.H, [&](int64_t, int64_t begin, int64_t end) {
+            for (int64_t i = begin; i < end; i++)
+                sights.heights(own.x[i], own.y.data(), u.W, &own.highest[i * u.W], &own.lowest[i * u.W]);
+        });
+    }
+
+    void span_cells() {
+        own.bottom.resize(cells), own.top.resize(cells), own.all_above.resize(cells);
+        own.number.assign(cells, 0), own.touched.clear();
+        for (int64_t m = 0; m < M; m++) {
+            const int32_t c = own.points.cell[m];
+            if (c < 0) continue;
+            const float z = own.points.z[m];
+            if (own.number[c]++ == 0) {
+                own.touched.push_back(c), own.bottom[c] = own.top[c] = z, own.all_above[c] = own.points.above[m];
+            } else {
+                own.bottom[c] = std::min(own.bottom[c], z), own.top[c] = std::max(own.top[c], z);
+                own.all_above[c] &= own.points.above[m];
+            }
+        }
+    }
+
+    // Sorting points into surfaces -------------------------------------------------------------------------------
+
+    bool floats(int64_t c, float top) const {
+        return sights.floats(own.x[c / u.W], own.y[c % u.W], top, own.lowest[c]);
+    }
+
+    // Whether a surface with its lowest point at this height hangs: rays passed below it, or it was seen from below.
+    bool hangs(int64_t c, float lower) const { return lower > from_below || floats(c, lower); }
+
+    bool has_levels(int64_t p) const {
+        bool any = false;
+        for (int64_t l = 0; l < u.L; l++) any |= u.support[(b * u.L + l) * cells + p] > 0;
+        return any;
+    }
+
+    // Whether all points of a cell are its ground's, or could become it: most are.
+    bool is_simple(int64_t c) const {
+        if (has_levels(place(c))) return false;
+        const float low = own.bottom[c], high = own.top[c];
+        if (!u.validity[b * cells + c]) return high - low <= u.min_gap && !own.all_above[c] && !hangs(c, low);
+        const float g = u.elevation[b * cells + c];
+        return g - low <= u.min_gap && high - g <= u.min_gap && !floats(c, g);
+    }
+
+    void sort_points() {
+        std::fill_n(u.aside + b * M, M, 0);
+        own.list.assign(cells, -1), own.complex.clear(), own.first.assign(1, 0);
+        for (const int32_t c : own.touched) {
+            if (is_simple(c)) continue;
+            own.list[c] = int32_t(own.complex.size()), own.complex.push_back(c);
+            own.first.push_back(own.first.back() + own.number[c]);
+        }
+        if (own.complex.empty()) return;
+        own.sorted.resize(own.first.back());
+        std::vector<int32_t> next(own.first.begin(), own.first.end() - 1);
+        for (int64_t m = 0; m < M; m++) {
+            const int32_t c = own.points.cell[m];
+            if (c >= 0 && own.list[c] >= 0) own.sorted[next[own.list[c]]++] = int32_t(m);
+        }
+        for (size_t k = 0; k < own.complex.size(); k++) sort_cell(own.complex[k], own.first[k], own.first[k + 1]);
+    }
+
+    // The clusters of a cell from below: `find_clusters`.
+    void find_clusters(int64_t begin, int64_t end, std::vector<Cluster>& clusters) {
+        const std::vector<float>& z = own.points.z;
+        std::stable_sort(own.sorted.begin() + begin, own.sorted.begin() + end, [&](int32_t a, int32_t c) { return z[a] < z[c]; });
+        clusters.clear();
+        for (int64_t k = begin; k < end; k++) {
+            const int32_t m = own.sorted[k];
+            if (k == begin || z[m] - z[own.sorted[k - 1]] > u.min_gap) {
+                clusters.emplace_back();
+                clusters.back().lower = z[m], clusters.back().begin = k;
+            }
+            Cluster& last = clusters.back();
+            const float w = 1 / own.points.noise[m];
+            last.upper = z[m], last.end = k + 1, last.weight += w, last.lift += w * (z[m] - last.lower), last.number++;
+            last.above &= own.points.above[m];
+        }
+    }
+
+    // `_shows_ground`
+    bool shows_ground(const std::vector<Cluster>& clusters, float g) const {
+        const float part = 0.25f * u.min_gap;
+        bool shows = false, solid = false;
+        for (const Cluster& k : clusters) {
+            shows |= k.lower <= g + SAME && k.upper >= g - SAME && k.lower >= g - part;
+            shows |= k.upper < g - u.min_gap;
+            solid |= k.lower < g - part && k.upper >= g - u.min_gap;
+        }
+        return shows && !solid;
+    }
+
+    // The ground as a surface: `_as_found`.
+    Found ground_of(int64_t c) const {
+        const int64_t n = b * cells + c;
+        const float g = u.elevation[n], variance = std::max(u.ground_variance[n] - g2, u.variance_floor);
+        return {g, g, g, variance, variance, std::max(u.ground_support[n], u.min_support)};
+    }
+
+    // Make a level the ground of a cell that has none.
+    void found_ground(int64_t c, int64_t l) const {
+        const int64_t n = b * cells + c, p = place(c), q = l * cells;
+        const Cell cell = cell_at(p);
+        u.elevation[n] = cell.upper[q], u.ground_variance[n] = cell.variance[q] + g2;
+        u.ground_support[n] = cell.support[q], u.ground_time[n] = cell.time[q];
+        u.validity[n] = 1, u.bounded[n] = 0, u.challenger_support[n] = 0;
+        cell.remove(l);
+    }
+
+    void forget_ground(int64_t c) const { u.validity[b * cells + c] = 0, u.challenger_support[b * cells + c] = 0; }
+
+    // Sort the points of a cell, by their places in `sorted`: `_sort_points`.
+    void sort_cell(int64_t c, int64_t begin, int64_t end) {
+        static thread_local std::vector<Cluster> clusters;
+        find_clusters(begin, end, clusters);
+        const int64_t p = place(c);
+        const Cell cell = cell_at(p);
+        float g = u.elevation[b * cells + c];
+        bool known = u.validity[b * cells + c];
+        const bool ground_floats = known && floats(c, g);
+        if (ground_floats && shows_ground(clusters, g)) {
+            statistics[levels::DROPPED] += cell.insert(ground_of(c), u.ground_time[b * cells + c]);
+            statistics[levels::OPENED]++, known = false, forget_ground(c);
+        }
+        for (size_t rank = 0; rank < clusters.size() && rank < size_t(2 * (u.L + 1)); rank++) {
+            const Found found = clusters[rank].found(u.variance_floor);
+            const float to_ground = known ? levels::distance(found.lower, found.upper, g, g) : INFINITE;
+            int64_t nearest = 0;
+            float to_level = INFINITE;
+            for (int64_t l = 0; l < u.L; l++) {
+                const int64_t q = l * cells;
+                if (!(cell.support[q] > 0)) continue;
+                const float away = levels::distance(found.lower, found.upper, cell.lower[q], cell.upper[q]);
+                if (away < to_level) to_level = away, nearest = l;
+            }
+            if (to_ground <= u.min_gap && to_ground <= to_level) continue;
+            if (to_level <= u.min_gap) {
+                const bool stands = !known && found.lower < cell.lower[nearest * cells] && !hangs(c, found.lower);
+                cell.fuse(nearest, found, u.max_support);
+                if (stands) found_ground(c, nearest), known = true, g = u.elevation[b * cells + c];
+            } else {
+                const bool above = known && found.lower > g;
+                bool shown = known && !above ? ground_floats
+                                             : (above && free_top(p) >= g + u.min_gap) || hangs(c, found.lower);
+                shown |= clusters[rank].above || (u.by_gap && (known || rank > 0));
+                if (!shown) continue;
+                statistics[levels::DROPPED] += cell.insert(found, 0), statistics[levels::OPENED]++;
+            }
+            for (int64_t k = clusters[rank].begin; k < clusters[rank].end; k++) u.aside[b * M + own.sorted[k]] = 1;
+        }
+    }
+
+    // Merge surfaces that meet, and clear those that rays passed through; note the highest rays.
+    void tidy() {
+        for (int64_t i = 0; i < u.H; i++)
+            for (int64_t j = 0; j < u.W; j++) {
+                const int64_t c = i * u.W + j, p = row[i] + column[j];
+                free_top(p) = std::max(free_top(p), own.highest[c]);
+                if (has_levels(p)) tidy_cell(c, p);
+            }
+    }
+
+    void tidy_cell(int64_t c, int64_t p) {
+        const Cell cell = cell_at(p);
+        statistics[levels::MERGED] += cell.merge();
+        const float g = u.elevation[b * cells + c];
+        for (int64_t l = 0; l < u.L; l++) {
+            const int64_t q = l * cells;
+            if (!(cell.support[q] > 0)) continue;
+            if (u.validity[b * cells + c] && levels::distance(cell.lower[q], cell.upper[q], g, g) < 0.5f * u.min_gap) {
+                cell.remove(l), statistics[levels::MERGED]++;
+            } else if (cell.time[q] > u.min_time) {
+                for (const levels::Sight& sight : own.sights)
+                    if (sight.passes(own.x[c / u.W], own.y[c % u.W], cell.lower[q], cell.upper[q], cell.variance[q], sights.size)) {
+                        cell.remove(l), statistics[levels::CLEARED]++;
+                        break;
+                    }
+            }
+        }
+    }
+
+    // Choosing the ground ----------------------------------------------------------------------------------------
+
+    void choose() {
+        levels::Search& search = own.search;
+        search.start(u.H, u.W, int(u.L) + 1);
+        search.max_step = u.max_step, search.rise = float(levels::SLOPE * u.resolution), search.max_blind = u.max_blind;
+        bool any = false;
+        const float least = std::max(u.min_support, 0.5f);
+        for (int64_t i = 0; i < u.H; i++)
+            for (int64_t j = 0; j < u.W; j++) {
+                const int64_t c = i * u.W + j, p = row[i] + column[j];
+                search.height[c] = u.validity[b * cells + c] ? u.elevation[b * cells + c] : NAN;
+                for (int64_t l = 0; l < u.L; l++) {
+                    const int64_t q = (b * u.L + l) * cells + p;
+                    const bool is_there = u.support[q] >= least;
+                    search.height[(l + 1) * cells + c] = is_there ? u.upper[q] : NAN, any |= is_there;
+                }
+            }
+        const levels::Standing standing = search.find_standing(base, own.x.data(), own.y.data());
+        if (!any && !has_strange(standing)) return;
+        search.run(standing);
+        own.changed.assign(cells, 0);
+        for (int64_t c = 0; c < cells; c++)
+            if (search.first[c] > 0) swap(c, search.first[c] - 1), own.changed[c] = 1, statistics[levels::CHOSEN]++;
+        demote_strange(standing);
+    }
+
+    // Whether a cell near the robot is of another floor, if it cannot be reached.
+    bool is_strange(int64_t c, const levels::Standing& standing) const {
+        const int64_t n = b * cells + c;
+        if (!u.validity[n] || !(u.ground_time[n] > 0)) return false;
+        const float x = own.x[c / u.W] - base[0], y = own.y[c % u.W] - base[1];
+        return std::fabs(u.elevation[n] - standing.height) > u.overlap_height &&
+               x * x + y * y <= u.overlap_radius * u.overlap_radius;
+    }
+
+    bool has_strange(const levels::Standing& standing) const {
+        if (!standing.found || u.overlap_radius <= 0) return false;
+        for (int64_t c = 0; c < cells; c++)
+            if (is_strange(c, standing)) return true;
+        return false;
+    }
+
+    void demote_strange(const levels::Standing& standing) {
+        if (!standing.found || u.overlap_radius <= 0) return;
+        for (int64_t c = 0; c < cells; c++) {
+            if (own.changed[c] || own.search.is_reached(c) || !is_strange(c, standing)) continue;
+            cell_at(place(c)).insert(ground_of(c), u.ground_time[b * cells + c]);
+            forget_ground(c);
+        }
+    }
+
+    // Exchange the ground of a cell with a level.
+    void swap(int64_t c, int64_t l) {
+        const int64_t n = b * cells + c, p = place(c), q = l * cells;
+        const Cell cell = cell_at(p);
+        const bool known = u.validity[n];
+        const Found old = ground_of(c);
+        const float time = u.ground_time[n], support = std::max(u.ground_support[n], 1.0f);
+        found_ground(c, l);
+        if (known) {
+            cell.lower[q] = cell.upper[q] = old.mean, cell.variance[q] = old.variance;
+            cell.support[q] = support, cell.time[q] = time;
+        }
+        free_top(p) = -INFINITE;
+    }
+
+    void put_aside() const {
+        if (!statistics[levels::CHOSEN]) return;
+        for (int64_t m = 0; m < M; m++) {
+            const int32_t c = own.points.cell[m];
+            if (c >= 0 && own.changed[c]) u.aside[b * M + m] = 1;
+        }
+    }
+};
+
+}  // namespace
+
+extern "C" int update_levels(const Update* u, int num_threads) {
+    return code_of([&] {
+        for_environments(u->B, num_threads, [&](int64_t b, int threads) {
+            static thread_local Scratch own;  // kept: pages that are new each time would take as long as the points
+            Map(*u, b, threads, own).run();
+        });
+    });
+}

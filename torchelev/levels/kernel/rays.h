@@ -1,0 +1,143 @@
+// What the rays of a scan passed through: rays.py, with the same names.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <vector>
+
+#include "levels/kernel/update.h"
+#include "stages/visibility/azimuth.h"
+
+namespace levels {
+
+using places::INFINITE;
+constexpr float MARGIN = 1.5f, NEAREST = 3.0f;
+constexpr int MAX_WINDOW = 8;
+constexpr float HEIGHTS[] = {0.3f, 0.5f, 0.7f};
+
+inline float horizontal(float x, float y) { return std::sqrt(x * x + y * y); }
+
+struct SightGrid {
+    int32_t azimuths, elevations, ranges;
+    float resolution, window;  // window: of a cell at 1 m [bins]
+
+    explicit SightGrid(const Update& u)
+        : azimuths(u.azimuths), elevations(u.elevations), ranges(u.ranges), resolution(float(u.resolution)),
+          window(float(0.75 * u.resolution * u.azimuths / (2 * 3.14159265358979323846))) {}
+
+    int32_t azimuth_bin(float x, float y) const {
+        const int32_t bin = int32_t(visibility::azimuth_fraction(x, y) * float(azimuths));
+        return std::min(bin, azimuths - 1);
+    }
+    int32_t elevation_bin(float rho, float dz) const {
+        const float fraction = 0.5f + 0.5f * (dz / std::max(rho + std::fabs(dz), 1e-12f));
+        return std::min(int32_t(fraction * float(elevations)), elevations - 1);
+    }
+};
+
+// What the rays of one sensor saw.
+struct Sight {
+    float origin[3];
+    std::vector<float> nearest, highest, lowest;
+
+    void look_for_nearest(const Points& p, int64_t begin, int64_t end, const SightGrid& size) {
+        nearest.assign(size_t(size.elevations) * size.azimuths, INFINITE);
+        for (int64_t m = begin; m < end; m++) {
+            if (!p.casts[m]) continue;
+            const float x = p.x[m] - origin[0], y = p.y[m] - origin[1], rho = horizontal(x, y);
+            float& known = nearest[size.elevation_bin(rho, p.z[m] - origin[2]) * size.azimuths + size.azimuth_bin(x, y)];
+            known = std::min(known, rho);
+        }
+    }
+
+    void look_for_slopes(const Points& p, int64_t begin, int64_t end, const SightGrid& size) {
+        const int64_t A = size.azimuths, R = size.ranges;
+        highest.assign(R * A, -INFINITE), lowest.assign(R * A, INFINITE);
+        for (int64_t m = begin; m < end; m++) {
+            const float x = p.x[m] - origin[0], y = p.y[m] - origin[1], rho = horizontal(x, y);
+            if (!p.casts[m] || !(rho > 0)) continue;
+            const float slope = (p.z[m] - origin[2]) / std::max(rho, 1e-12f);
+            const int64_t k = std::min(int64_t(rho / size.resolution), R - 1) * A + size.azimuth_bin(x, y);
+            highest[k] = std::max(highest[k], slope), lowest[k] = std::min(lowest[k], slope);
+        }
+        for (int64_t k = (R - 1) * A - 1; k >= 0; k--) {
+            highest[k] = std::max(highest[k], highest[k + A]);
+            lowest[k] = std::min(lowest[k], lowest[k + A]);
+        }
+    }
+
+    // Return the nearest return in the directions that cover a place [m], and set the distance of its cell [m].
+    float nearest_around(float x, float y, float z, const SightGrid& size, float& d) const {
+        const float dx = x - origin[0], dy = y - origin[1];
+        d = horizontal(dx, dy);
+        const int32_t A = size.azimuths, azimuth = size.azimuth_bin(dx, dy);
+        const float* row = nearest.data() + size.elevation_bin(d, z - origin[2]) * A;
+        const int half = std::min(int(std::ceil(size.window / std::max(d, size.resolution))), MAX_WINDOW);
+        float found = INFINITE;
+        for (int k = -half; k <= half; k++) found = std::min(found, row[(azimuth + k + A) % A]);
+        return found;
+    }
+
+    bool is_free(float x, float y, float z, const SightGrid& size) const {
+        float d;
+        const float found = nearest_around(x, y, z, size, d);
+        return found < INFINITE && found >= d + MARGIN * size.resolution && d >= NEAREST * size.resolution;
+    }
+
+    // Whether rays passed through a surface of a cell: `_seen_through`.
+    bool passes(float x, float y, float low, float high, float variance, const SightGrid& size) const {
+        const float middle = 0.5f * (low + high);
+        float d;
+        const float found = nearest_around(x, y, middle, size, d);
+        const float slope = std::fabs(middle - origin[2]) / std::max(d, size.resolution);
+        const float noise = 3.0f * std::sqrt(variance) + (d / float(size.elevations)) * ((1 + slope) * (1 + slope));
+        const bool is_thick = high - low >= 2 * noise, is_steep = MARGIN * size.resolution * slope >= noise;
+        const float behind = found - d;
+        return behind >= MARGIN * size.resolution && (is_thick || (is_steep && behind * slope >= noise)) &&
+               found < INFINITE && d >= NEAREST * size.resolution;
+    }
+};
+
+// What the rays of all sensors saw.
+struct Sights {
+    SightGrid size;
+    std::vector<Sight>& of;
+    float min_gap;
+
+    // Whether rays passed below a surface at height `top` over a cell, where `lowest` is the lowest ray [m].
+    bool floats(float x, float y, float top, float lowest) const {
+        if (!(lowest < top - HEIGHTS[0] * min_gap)) return false;
+        for (const Sight& sight : of)
+            for (const float part : HEIGHTS)
+                if (sight.is_free(x, y, top - part * min_gap, size)) return true;
+        return false;
+    }
+
+    // Find the heights of the highest and the lowest ray over the cells of a row [m].
+    void heights(float x, const float* y, int64_t W, float* highest, float* lowest) const {
+        constexpr int64_t BLOCK = 64;
+        std::fill_n(highest, W, -INFINITE), std::fill_n(lowest, W, INFINITE);
+        for (const Sight& sight : of) {
+            const float dx = x - sight.origin[0];
+            for (int64_t first = 0; first < W; first += BLOCK) {
+                float d[BLOCK];
+                int32_t place[BLOCK];
+                const int64_t number = std::min(BLOCK, W - first);
+                for (int64_t n = 0; n < number; n++) {
+                    const float dy = y[first + n] - sight.origin[1];
+                    d[n] = horizontal(dx, dy);
+                    const int32_t row = std::min(int32_t(d[n] / size.resolution + MARGIN), size.ranges - 1);
+                    place[n] = row * size.azimuths + size.azimuth_bin(dx, dy);
+                }
+                for (int64_t n = 0; n < number; n++) {
+                    const float up = sight.origin[2] + sight.highest[place[n]] * d[n];
+                    const float down = sight.origin[2] + sight.lowest[place[n]] * d[n];
+                    highest[first + n] = std::max(highest[first + n], up);
+                    lowest[first + n] = std::min(lowest[first + n], down);
+                }
+            }
+        }
+    }
+};
+
+}  // namespace levels

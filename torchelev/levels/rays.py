@@ -1,0 +1,142 @@
+"""What the rays of a scan passed through: the nearest return of each direction, and the highest ray over each cell.
+
+All rays of a sensor share an origin, so a direction is free up to its nearest return. Directions are bins of azimuth and
+elevation; a place is free only if all returns of the bins that cover it lie farther.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchelev.grid import GridConfig
+from torchelev.stages.visibility.polar_table import azimuth_fraction
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+
+MARGIN = 1.5  # [cells] behind a place that a ray must reach
+NEAREST = 3.0  # [cells] from the sensor, below which directions cover too much
+MAX_WINDOW = 8  # [bins] of azimuth on either side of a place
+
+
+class SightGrid(NamedTuple):
+    """Size of the tables of one sensor."""
+
+    azimuths: int  #: A, bins around the sensor
+    elevations: int  #: E, bins from straight down to straight up
+    ranges: int  #: R, bins of one cell along a ray
+    resolution: float  #: [m] of the map
+
+    @classmethod
+    def of(cls, grid: GridConfig) -> SightGrid:
+        """Choose bins as wide as a cell at half the reach of the window."""
+        cells = max(grid.height, grid.width)
+        azimuths = min(1024, max(64, 2 ** math.ceil(math.log2(math.pi * cells / 2))))
+        reach = math.ceil(math.hypot(grid.height, grid.width)) + 4
+        return cls(azimuths, azimuths // 4, reach, grid.resolution)
+
+
+class Sight(NamedTuple):
+    """What the rays of one sensor saw."""
+
+    origin: Float[Tensor, "B 3"]  #: [m] of the sensor, from the measurement's anchor
+    nearest: Float[Tensor, "B EA"]  #: [m] horizontal range of the nearest return of each direction; inf: none
+    highest: Float[Tensor, "B RA"]  #: greatest slope of the rays that end at or beyond each range; -inf: none
+
+
+def azimuth_bin(x: Tensor, y: Tensor, size: SightGrid) -> Int[Tensor, "..."]:
+    """Return the azimuth bins of directions."""
+    return (azimuth_fraction(x, y) * size.azimuths).to(torch.int64).clamp(0, size.azimuths - 1)
+
+
+def elevation_bin(rho: Tensor, dz: Tensor, size: SightGrid) -> Int[Tensor, "..."]:
+    """Return the bins of elevation, (1 + dz / (rho + |dz|)) / 2 in [0, 1]: monotonic, and without an arc tangent."""
+    fraction = 0.5 + 0.5 * (dz / (rho + dz.abs()).clamp(min=1e-12))
+    return (fraction * size.elevations).to(torch.int64).clamp(0, size.elevations - 1)
+
+
+def horizontal(x: Tensor, y: Tensor) -> Tensor:
+    """Return the horizontal distance."""
+    return (x * x + y * y).sqrt()
+
+
+def look(points: Float[Tensor, "B M 3"], casts: Bool[Tensor, "B M"], origin: Tensor, size: SightGrid) -> Sight:
+    """Return what the rays to some points of one sensor saw.
+
+    Args:
+        points: ends of the rays [m], from the measurement's anchor.
+        casts: which of them count.
+        origin: of the sensor (B, 3) [m].
+        size: of the tables.
+    """
+    x, y, z = (points - origin[:, None]).unbind(-1)
+    rho, A = horizontal(x, y), size.azimuths
+    azimuth = azimuth_bin(x, y, size)
+    direction = elevation_bin(rho, z, size) * A + azimuth
+    nearest = rho.new_full((len(rho), size.elevations * A), torch.inf)
+    nearest = nearest.scatter_reduce(1, direction, torch.where(casts, rho, torch.inf), "amin")
+    reached = (rho / size.resolution).to(torch.int64).clamp(max=size.ranges - 1)
+    slope = torch.where(casts & (rho > 0), z / rho.clamp(min=1e-12), -torch.inf)
+    highest = rho.new_full((len(rho), size.ranges * A), -torch.inf)
+    highest = highest.scatter_reduce(1, reached * A + azimuth, slope, "amax").unflatten(1, (size.ranges, A))
+    highest = highest.flip(1).cummax(1).values.flip(1)
+    return Sight(origin, nearest, highest.flatten(1))
+
+
+def nearest_around(sight: Sight, x: Tensor, y: Tensor, z: Tensor, size: SightGrid) -> tuple[Tensor, Tensor]:
+    """Return the nearest return [m] in the directions that cover a cell at some height, and its distance [m].
+
+    Args:
+        sight: of one sensor.
+        x: centre of the cell (B, Q) [m], as `origin`.
+        y: centre of the cell (B, Q) [m].
+        z: height of the place (B, Q) [m].
+        size: of the tables.
+
+    Returns:
+        The range, inf where no ray went there, and the horizontal distance of the cell.
+    """
+    dx, dy, dz = (value - origin for value, origin in zip((x, y, z), sight.origin[:, :, None].unbind(1), strict=True))
+    d, A = horizontal(dx, dy), size.azimuths
+    azimuth, row = azimuth_bin(dx, dy, size), elevation_bin(d, dz, size) * A
+    half = (0.75 * size.resolution * A / (2 * math.pi)) / d.clamp(min=size.resolution)
+    window = half.ceil().clamp(max=MAX_WINDOW)
+    found = torch.full_like(d, torch.inf)
+    for k in range(-MAX_WINDOW, MAX_WINDOW + 1):
+        value = sight.nearest.gather(1, row + (azimuth + k) % A)
+        found = torch.where(window >= abs(k), torch.minimum(found, value), found)
+    return found, d
+
+
+def is_free(sight: Sight, x: Tensor, y: Tensor, z: Tensor, size: SightGrid) -> Bool[Tensor, "B Q"]:
+    """Return whether rays passed through a cell at some height, and none ended there; arguments as above."""
+    found, d = nearest_around(sight, x, y, z, size)
+    return (found < torch.inf) & (found >= d + MARGIN * size.resolution) & (d >= NEAREST * size.resolution)
+
+
+HEIGHTS = (0.3, 0.5, 0.7)  # parts of the gap below a surface at which rays are looked for
+
+
+def floats(sights: list[Sight], x: Tensor, y: Tensor, top: Tensor, min_gap: float, size: SightGrid) -> Tensor:
+    """Return whether rays passed below a surface at height `top` (B, Q) [m] over a cell: it hangs free."""
+    found = torch.zeros_like(top, dtype=torch.bool)
+    for sight in sights:
+        for part in HEIGHTS:
+            found = found | is_free(sight, x, y, top - part * min_gap, size)
+    return found
+
+
+def free_height(sights: list[Sight], x: Tensor, y: Tensor, size: SightGrid) -> Float[Tensor, "B Q"]:
+    """Return the height [m] of the highest ray over each cell; -inf where there is none."""
+    best = torch.full_like(x, -torch.inf)
+    for sight in sights:
+        dx, dy = x - sight.origin[:, 0, None], y - sight.origin[:, 1, None]
+        d = horizontal(dx, dy)
+        row = (d / size.resolution + MARGIN).to(torch.int64).clamp(max=size.ranges - 1)
+        slope = sight.highest.gather(1, row * size.azimuths + azimuth_bin(dx, dy, size))
+        best = torch.maximum(best, sight.origin[:, 2, None] + slope * d)
+    return best
