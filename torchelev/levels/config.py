@@ -26,7 +26,7 @@ class LevelsConfig:
     #: what shows that the space between two surfaces is free: "rays" that pass through it, or the "gap" alone
     separation: str = "rays"
     max_step: float = 0.3  #: [m] that the robot can step up or down from a cell to the next
-    max_blind: float = 1.0  #: [m] of unknown cells over which the ground is taken to go on
+    max_blind: float = 0.5  #: [m] of unknown cells over which the ground is taken to go on
     min_support: float = 3.0  #: points that a surface needs to be reported, or chosen as the ground
 
     def __post_init__(self) -> None:

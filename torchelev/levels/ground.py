@@ -73,8 +73,8 @@ def choose_ground(
 ) -> tuple[Int[Tensor, "B H W"], Bool[Tensor, "B H W"]]:
     """Find the surface that each cell is first reached on, from cell to cell by steps of at most `max_step`.
 
-    Ground that is not known is guessed to go on as it was, over at most `max_blind`; to surfaces beyond it, `SLOPE`
-    adds to the step. All steps of a number come before those of the next, so the way is the shortest.
+    Ground that is not known is guessed to go on as it was, over at most `max_blind`; to ground beyond it, `SLOPE` adds
+    to the step. It never leads onto another surface: the floor behind a table's shadow is no way onto the table. All steps of a number come before those of the next, so the way is the shortest.
 
     Args:
         heights: of the ground and the other surfaces [m].
@@ -131,7 +131,10 @@ def _step(
             height = _beside(wave.height[:, k], axis, step, 0.0)
             blind = _beside(wave.blind[:, k], axis, step, 0)
             limit = cfg.max_step + (SLOPE * grid.resolution) * blind.to(heights.dtype)
-            reached = reached | (comes & ((heights.movedim(1, 0) - height).abs() <= limit)).movedim(0, 1)
+            near = (comes & ((heights.movedim(1, 0) - height).abs() <= limit)).movedim(0, 1)
+            if k == len(heights[0]):  # what is guessed leads to the ground alone
+                near = torch.cat([near[:, :1], torch.zeros_like(near[:, 1:])], 1)
+            reached = reached | near
             goes_on = comes & (blind < blind_limit)
             is_lower = goes_on & (height < guess)
             is_same = goes_on & (height == guess)

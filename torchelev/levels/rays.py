@@ -28,7 +28,7 @@ class SightGrid(NamedTuple):
 
     azimuths: int  #: A, bins around the sensor
     elevations: int  #: E, bins from straight down to straight up
-    ranges: int  #: R, bins of one cell along a ray
+    ranges: int  #: R, bins of one cell along a ray; the last one stays blank, for what lies out of reach
     resolution: float  #: [m] of the map
 
     @classmethod
@@ -36,7 +36,7 @@ class SightGrid(NamedTuple):
         """Choose bins as wide as a cell at half the reach of the window."""
         cells = max(grid.height, grid.width)
         azimuths = min(1024, max(64, 2 ** math.ceil(math.log2(math.pi * cells / 2))))
-        reach = math.ceil(math.hypot(grid.height, grid.width)) + 4
+        reach = math.ceil(0.75 * math.hypot(grid.height, grid.width)) + 4  # the sensor is near the middle
         return cls(azimuths, azimuths // 4, reach, grid.resolution)
 
 
@@ -46,6 +46,7 @@ class Sight(NamedTuple):
     origin: Float[Tensor, "B 3"]  #: [m] of the sensor, from the measurement's anchor
     nearest: Float[Tensor, "B EA"]  #: [m] horizontal range of the nearest return of each direction; inf: none
     highest: Float[Tensor, "B RA"]  #: greatest slope of the rays that end at or beyond each range; -inf: none
+    lowest: Float[Tensor, "B RA"]  #: least slope of these; inf: none
 
 
 def azimuth_bin(x: Tensor, y: Tensor, size: SightGrid) -> Int[Tensor, "..."]:
@@ -79,12 +80,18 @@ def look(points: Float[Tensor, "B M 3"], casts: Bool[Tensor, "B M"], origin: Ten
     direction = elevation_bin(rho, z, size) * A + azimuth
     nearest = rho.new_full((len(rho), size.elevations * A), torch.inf)
     nearest = nearest.scatter_reduce(1, direction, torch.where(casts, rho, torch.inf), "amin")
-    reached = (rho / size.resolution).to(torch.int64).clamp(max=size.ranges - 1)
-    slope = torch.where(casts & (rho > 0), z / rho.clamp(min=1e-12), -torch.inf)
-    highest = rho.new_full((len(rho), size.ranges * A), -torch.inf)
-    highest = highest.scatter_reduce(1, reached * A + azimuth, slope, "amax").unflatten(1, (size.ranges, A))
-    highest = highest.flip(1).cummax(1).values.flip(1)
-    return Sight(origin, nearest, highest.flatten(1))
+    reached = (rho / size.resolution).to(torch.int64).clamp(max=size.ranges - 2) * A + azimuth
+    slope, counts = z / rho.clamp(min=1e-12), casts & (rho > 0)
+    highest = _beyond(torch.where(counts, slope, -torch.inf), reached, size)
+    lowest = -_beyond(torch.where(counts, -slope, -torch.inf), reached, size)
+    return Sight(origin, nearest, highest, lowest)
+
+
+def _beyond(values: Tensor, place: Tensor, size: SightGrid) -> Tensor:
+    """Return the greatest value at or beyond each range, (B, R A)."""
+    table = values.new_full((len(values), size.ranges * size.azimuths), -torch.inf)
+    table = table.scatter_reduce(1, place, values, "amax").unflatten(1, (size.ranges, size.azimuths))
+    return table.flip(1).cummax(1).values.flip(1).flatten(1)
 
 
 def nearest_around(sight: Sight, x: Tensor, y: Tensor, z: Tensor, size: SightGrid) -> tuple[Tensor, Tensor]:
@@ -121,22 +128,35 @@ def is_free(sight: Sight, x: Tensor, y: Tensor, z: Tensor, size: SightGrid) -> B
 HEIGHTS = (0.3, 0.5, 0.7)  # parts of the gap below a surface at which rays are looked for
 
 
-def floats(sights: list[Sight], x: Tensor, y: Tensor, top: Tensor, min_gap: float, size: SightGrid) -> Tensor:
-    """Return whether rays passed below a surface at height `top` (B, Q) [m] over a cell: it hangs free."""
+class RayHeights(NamedTuple):
+    """The rays over each cell: those that end more than a cell behind it."""
+
+    highest: Float[Tensor, "B cells"]  #: [m] -inf: none
+    lowest: Float[Tensor, "B cells"]  #: [m] inf: none
+
+
+def ray_heights(sights: list[Sight], x: Tensor, y: Tensor, size: SightGrid) -> RayHeights:
+    """Return the heights of the highest and the lowest ray over cells with these centres (B, cells) [m]."""
+    highest, lowest = torch.full_like(x, -torch.inf), torch.full_like(x, torch.inf)
+    for sight in sights:
+        dx, dy = x - sight.origin[:, 0, None], y - sight.origin[:, 1, None]
+        d, z = horizontal(dx, dy), sight.origin[:, 2, None]
+        row = (d / size.resolution + MARGIN).to(torch.int64).clamp(max=size.ranges - 1)
+        place = row * size.azimuths + azimuth_bin(dx, dy, size)
+        highest = torch.maximum(highest, z + sight.highest.gather(1, place) * d)
+        lowest = torch.minimum(lowest, z + sight.lowest.gather(1, place) * d)
+    return RayHeights(highest, lowest)
+
+
+def floats(
+    sights: list[Sight], x: Tensor, y: Tensor, top: Tensor, lowest: Tensor, min_gap: float, size: SightGrid
+) -> Bool[Tensor, "B Q"]:
+    """Return whether rays passed below a surface at height `top` (B, Q) [m] over a cell: it hangs free.
+
+    The lowest ray over the cell passes below it, and in the directions of the space below it no ray ends before.
+    """
     found = torch.zeros_like(top, dtype=torch.bool)
     for sight in sights:
         for part in HEIGHTS:
             found = found | is_free(sight, x, y, top - part * min_gap, size)
-    return found
-
-
-def free_height(sights: list[Sight], x: Tensor, y: Tensor, size: SightGrid) -> Float[Tensor, "B Q"]:
-    """Return the height [m] of the highest ray over each cell; -inf where there is none."""
-    best = torch.full_like(x, -torch.inf)
-    for sight in sights:
-        dx, dy = x - sight.origin[:, 0, None], y - sight.origin[:, 1, None]
-        d = horizontal(dx, dy)
-        row = (d / size.resolution + MARGIN).to(torch.int64).clamp(max=size.ranges - 1)
-        slope = sight.highest.gather(1, row * size.azimuths + azimuth_bin(dx, dy, size))
-        best = torch.maximum(best, sight.origin[:, 2, None] + slope * d)
-    return best
+    return found & (lowest < top - HEIGHTS[0] * min_gap)

@@ -10,8 +10,18 @@ from torch import Tensor
 from torchelev.grid import locate
 from torchelev.levels.clusters import Clusters, find_clusters, in_cells
 from torchelev.levels.config import LevelsConfig
-from torchelev.levels.ground import choose_ground, find_standing
-from torchelev.levels.rays import Sight, SightGrid, floats, free_height, look, nearest_around
+from torchelev.levels.ground import NONE, choose_ground, find_standing
+from torchelev.levels.rays import (
+    MARGIN,
+    NEAREST,
+    RayHeights,
+    Sight,
+    SightGrid,
+    floats,
+    look,
+    nearest_around,
+    ray_heights,
+)
 from torchelev.levels.state import Levels, LevelStatistics, age, move, remove
 from torchelev.levels.surfaces import GATE, Found, distance, fuse, insert, merge
 from torchelev.ops.masks import count
@@ -24,6 +34,7 @@ if TYPE_CHECKING:
 
     from torchelev.config import ElevationMapConfig
 
+GROUND = ("elevation", "variance", "validity", "support", "challenger_support", "time", "bounded")
 SAME = 0.1  # [m] by which points may miss the ground and still show that it is there
 
 
@@ -40,9 +51,10 @@ class _Scan(NamedTuple):
     """A scan over the window."""
 
     clusters: Clusters
-    floating: Bool[Tensor, "B M"]  # clusters below which rays passed
+    hangs: Bool[Tensor, "B M"]  # clusters below which rays passed, or which were seen from below
     ground_floats: Bool[Tensor, "B cells"]
     sights: list[Sight]
+    rays: RayHeights
     x: Float[Tensor, "B cells"]  # centres of the cells [m]
     y: Float[Tensor, "B cells"]
 
@@ -61,25 +73,29 @@ def update_levels(
     """
     assert cfg.levels is not None
     grid, own = cfg.grid, cfg.levels
-    largest = max(grid.height, grid.width)
+    size, largest = (grid.height, grid.width), max(grid.height, grid.width)
     levels = move(levels, shift.clamp(-largest, largest))
     levels = age(levels, m.dt, cfg.aging.variance_rate, cfg.fusion.max_variance)
-    flat = Levels(*(part.flatten(-2) for part in levels))
-    scan = _look_at(flat, state, m, cfg)
-    flat, ground, aside, opened, dropped = _sort_points(flat, state, scan, cfg)
-    flat, gone = merge(flat)
-    touching = (flat.support > 0) & ground[:, None] & (_to_ground(flat, state) < 0.5 * own.min_gap)
-    flat = remove(flat, gone | touching)
-    cleared = _seen_through(flat, scan, cfg)
-    flat = remove(flat, cleared)
-    flat = flat._replace(free_top=torch.maximum(flat.free_top, free_height(scan.sights, scan.x, scan.y, _size(cfg))))
-    unflat = Levels(*(part.unflatten(-1, (grid.height, grid.width)) for part in flat))
-    state = state._replace(validity=ground.unflatten(1, (grid.height, grid.width)))
-    unflat, state, changed = _choose(unflat, state, m, cfg)
     slot, inside = _slots(state, m, cfg)
-    aside = inside & (aside | changed.flatten(1).gather(1, slot))
-    numbers = (opened, count(cleared), count(gone | touching), dropped, count(changed))
-    return Step(unflat, state, aside, LevelStatistics(*numbers))
+    scan = _look_at(state, m, slot, inside, cfg)
+    levels = Levels(*(part.flatten(-2) for part in levels))
+    state = state._replace(**{name: getattr(state, name).flatten(1) for name in GROUND})
+    levels, state, aside, opened, dropped = _sort_points(levels, state, scan, cfg)
+    levels, met = merge(levels)
+    away = distance(levels.lower, levels.upper, state.elevation[:, None], state.elevation[:, None])
+    met = met | ((levels.support > 0) & state.validity[:, None] & (away < 0.5 * own.min_gap))
+    levels = remove(levels, met)
+    cleared = _seen_through(levels, scan, cfg)
+    levels = remove(levels, cleared)
+    levels = levels._replace(free_top=torch.maximum(levels.free_top, scan.rays.highest))
+    levels, state, changed = _choose(levels, state, m, scan, cfg)
+    aside = inside & (aside | changed.gather(1, slot))
+    return Step(
+        Levels(*(part.unflatten(-1, size) for part in levels)),
+        state._replace(**{name: getattr(state, name).unflatten(1, size) for name in GROUND}),
+        aside,
+        LevelStatistics(opened, count(cleared), count(met), dropped, count(changed)),
+    )
 
 
 def _size(cfg: ElevationMapConfig) -> SightGrid:
@@ -91,7 +107,7 @@ def _slots(state: MapState, m: Measurement, cfg: ElevationMapConfig) -> tuple[Te
     return slot.to(torch.int64), inside & m.casts
 
 
-def _look_at(levels: Levels, state: MapState, m: Measurement, cfg: ElevationMapConfig) -> _Scan:
+def _look_at(state: MapState, m: Measurement, slot: Tensor, inside: Tensor, cfg: ElevationMapConfig) -> _Scan:
     """Return the clusters of a scan, and what its rays saw."""
     assert cfg.levels is not None
     size, gap, S = _size(cfg), cfg.levels.min_gap, m.origin.shape[1]
@@ -100,62 +116,59 @@ def _look_at(levels: Levels, state: MapState, m: Measurement, cfg: ElevationMapC
     x, y = center_offsets(state, m, cfg.grid)
     shape = state.elevation.shape
     x, y = x.expand(shape).flatten(1), y.expand(shape).flatten(1)
-    slot, inside = _slots(state, m, cfg)
     noise = m.variance if m.noise is None else m.noise
     given = m.points[..., 2], torch.where(inside, noise, 1.0), slot, inside, ~m.used
     clusters = find_clusters(*given, cfg.grid.num_cells, gap)
     place = clusters.slot.clamp(max=cfg.grid.num_cells - 1)
-    floating = floats(sights, x.gather(1, place), y.gather(1, place), clusters.lower.clamp(max=1e6), gap, size)
-    ground_floats = floats(sights, x, y, state.elevation.flatten(1), gap, size) & state.validity.flatten(1)
-    return _Scan(clusters, floating, ground_floats, sights, x, y)
-
-
-def _to_ground(levels: Levels, state: MapState) -> Float[Tensor, "B L cells"]:
-    """Return the distance of each surface from the ground [m]."""
-    ground = state.elevation.flatten(1)[:, None]
-    return distance(levels.lower, levels.upper, ground, ground)
+    rays, lower = ray_heights(sights, x, y, size), clusters.lower.clamp(max=1e6)
+    at = (values.gather(1, place) for values in (x, y))
+    hangs = floats(sights, *at, lower, rays.lowest.gather(1, place), gap, size)
+    hangs = hangs | (lower > m.origin[..., 2].amax(1)[:, None] + 0.5 * gap)  # seen from below
+    ground_floats = floats(sights, x, y, state.elevation.flatten(1), rays.lowest, gap, size)
+    return _Scan(clusters, hangs, ground_floats & state.validity.flatten(1), sights, rays, x, y)
 
 
 def _sort_points(
     levels: Levels, state: MapState, scan: _Scan, cfg: ElevationMapConfig
-) -> tuple[Levels, Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Levels, MapState, Bool[Tensor, "B M"], Int[Tensor, "B"], Int[Tensor, "B"]]:
     """Sort clusters into the ground, surfaces that are there, and new ones.
 
     Returns:
-        The levels, which cells still have a ground (B, cells), which points are set aside (B, M), and the numbers of
-        surfaces that were opened and dropped.
+        The levels, the state, the points that are set aside, and how many surfaces were opened and dropped.
     """
     own, clusters, num_cells = cfg.levels, scan.clusters, cfg.grid.num_cells
     assert own is not None
-    g, known = state.elevation.flatten(1), state.validity.flatten(1)
-    demoted = known & scan.ground_floats & _shows_ground(clusters, g, own, num_cells)
-    levels, lost = insert(levels, demoted, _as_found(state, own), state.time.flatten(1))
-    dropped, opened, known = count(lost), count(demoted), known & ~demoted
+    demoted = state.validity & scan.ground_floats & _shows_ground(clusters, state.elevation, own, num_cells)
+    levels, lost = insert(levels, demoted, _as_found(state, cfg), state.time)
+    state, dropped, opened = _forget_ground(state, demoted), count(lost), count(demoted)
     aside_of = torch.zeros_like(clusters.slot, dtype=torch.bool)
     for rank in range(2 * own.max_levels):
         there = in_cells(clusters.number, clusters, rank, num_cells, 0.0)
         found = _found_of(clusters, rank, cfg)
-        ramp, flies = (
+        ramp, hangs = (
             in_cells(mask.to(there.dtype), clusters, rank, num_cells, 0.0) > 0
-            for mask in (clusters.above_ramp, scan.floating)
+            for mask in (clusters.above_ramp, scan.hangs)
         )
+        g, known = state.elevation, state.validity
         dg = torch.where(known, distance(found.lower, found.upper, g, g), torch.inf)
         away = distance(found.lower[:, None], found.upper[:, None], levels.lower, levels.upper)
         dl, nearest = torch.where(levels.support > 0, away, torch.inf).min(1)
         to_ground = (dg <= own.min_gap) & (dg <= dl)
         to_level = (there > 0) & ~to_ground & (dl <= own.min_gap)
         above = known & (found.lower > g)
-        shown = torch.where(known & ~above, scan.ground_floats, flies | (above & (levels.free_top >= g + own.min_gap)))
+        shown = torch.where(known & ~above, scan.ground_floats, hangs | (above & (levels.free_top >= g + own.min_gap)))
         if own.separation == "gap":
             shown = shown | known | (rank > 0)
         opens = (there > 0) & ~to_ground & ~to_level & (shown | ramp)
         chosen = torch.zeros_like(levels.support, dtype=torch.bool).scatter(1, nearest[:, None], to_level[:, None])
+        stands = to_level & ~known & (found.lower < levels.lower.gather(1, nearest[:, None])[:, 0]) & ~hangs
         levels = fuse(levels, chosen, found, cfg.fusion.max_support)
+        levels, state = found_ground(levels, state, torch.where(stands, nearest, NONE))
         levels, lost = insert(levels, opens, found, 0.0)
         dropped, opened = dropped + count(lost), opened + count(opens)
         other = torch.nn.functional.pad(to_level | opens, (0, 1))
         aside_of = aside_of | ((clusters.rank == rank) & other.gather(1, clusters.slot))
-    return levels, known, aside_of.gather(1, clusters.of_point), opened, dropped
+    return levels, state, aside_of.gather(1, clusters.of_point), opened, dropped
 
 
 def _shows_ground(clusters: Clusters, g: Tensor, own: LevelsConfig, num_cells: int) -> Bool[Tensor, "B cells"]:
@@ -173,10 +186,18 @@ def _shows_ground(clusters: Clusters, g: Tensor, own: LevelsConfig, num_cells: i
     return any_of(hits | below) & ~any_of(solid)
 
 
-def _as_found(state: MapState, own: LevelsConfig) -> Found:
-    """Return the ground as a surface."""
-    g, variance = state.elevation.flatten(1), state.variance.flatten(1)
-    return Found(g, g, g, variance, variance, state.support.flatten(1).clamp(min=own.min_support))
+def _as_found(state: MapState, cfg: ElevationMapConfig) -> Found:
+    """Return the ground as a surface, without what the disagreement of scans adds to its variance."""
+    assert cfg.levels is not None
+    g, disagreement = state.elevation, state.statistics.disagreement.square()[:, None]
+    variance = (state.variance - disagreement).clamp(min=cfg.fusion.scan_variance_floor)
+    return Found(g, g, g, variance, variance, state.support.clamp(min=cfg.levels.min_support))
+
+
+def _forget_ground(state: MapState, cells: Bool[Tensor, "B cells"]) -> MapState:
+    return state._replace(
+        validity=state.validity & ~cells, challenger_support=torch.where(cells, 0, state.challenger_support)
+    )
 
 
 def _found_of(clusters: Clusters, rank: int, cfg: ElevationMapConfig) -> Found:
@@ -184,9 +205,7 @@ def _found_of(clusters: Clusters, rank: int, cfg: ElevationMapConfig) -> Found:
     n = cfg.grid.num_cells
     weight = in_cells(clusters.weight, clusters, rank, n, 1.0)
     number = in_cells(clusters.number, clusters, rank, n, 0.0)
-    lower, upper, mean = (
-        in_cells(v, clusters, rank, n, 0.0) for v in (clusters.lower, clusters.upper, clusters.mean)
-    )
+    lower, upper, mean = (in_cells(v, clusters, rank, n, 0.0) for v in (clusters.lower, clusters.upper, clusters.mean))
     variance = (1 / weight).clamp(min=cfg.fusion.scan_variance_floor)
     return Found(lower, upper, mean, variance, number / weight, number)
 
@@ -210,69 +229,75 @@ def _seen_through(levels: Levels, scan: _Scan, cfg: ElevationMapConfig) -> Bool[
             nearest, d = nearest_around(sight, scan.x, scan.y, middle, size)
             slope = (middle - sight.origin[:, 2, None]).abs() / d.clamp(min=size.resolution)
             noise = GATE * levels.variance[:, k].sqrt() + (d / size.elevations) * (1 + slope).square()
-            is_thick, is_steep = tall >= 2 * noise, 1.5 * size.resolution * slope >= noise
+            is_thick, is_steep = tall >= 2 * noise, MARGIN * size.resolution * slope >= noise
             behind = nearest - d
-            passes = (behind >= MARGIN_CELLS * size.resolution) & (is_thick | (is_steep & (behind * slope >= noise)))
-            through = through | (passes & (nearest < torch.inf) & (d >= 3.0 * size.resolution))
+            passes = (behind >= MARGIN * size.resolution) & (is_thick | (is_steep & (behind * slope >= noise)))
+            through = through | (passes & (nearest < torch.inf) & (d >= NEAREST * size.resolution))
         parts.append(through)
     return old & torch.stack(parts, 1)
 
 
-MARGIN_CELLS = 1.5  # behind a surface that a ray must reach
-
-
 def _choose(
-    levels: Levels, state: MapState, m: Measurement, cfg: ElevationMapConfig
-) -> tuple[Levels, MapState, Bool[Tensor, "B H W"]]:
-    """Make the surface that the robot reaches first the ground, and return where it changed."""
-    own = cfg.levels
+    levels: Levels, state: MapState, m: Measurement, scan: _Scan, cfg: ElevationMapConfig
+) -> tuple[Levels, MapState, Bool[Tensor, "B cells"]]:
+    """Make the surface that the robot reaches first the ground, and return where it changed.
+
+    Near the robot, ground of another floor that it cannot reach becomes a level too (paper, Sec. II-F, without the
+    forgetting).
+    """
+    own, size = cfg.levels, (cfg.grid.height, cfg.grid.width)
     assert own is not None
     if m.base is None:
         return levels, state, torch.zeros_like(state.validity)
-    heights = torch.cat([state.elevation[:, None], levels.upper], 1)
-    known = torch.cat([state.validity[:, None], levels.support >= max(own.min_support, 0.5)], 1)
-    x, y = center_offsets(state, m, cfg.grid)
-    square = (x - m.base[:, 0, None, None]).square() + (y - m.base[:, 1, None, None]).square()
-    standing = find_standing(heights, known, m.base, square.expand_as(state.elevation))
+    heights = torch.cat([state.elevation[:, None], levels.upper], 1).unflatten(2, size)
+    known = torch.cat([state.validity[:, None], levels.support >= max(own.min_support, 0.5)], 1).unflatten(2, size)
+    square = (scan.x - m.base[:, 0, None]).square() + (scan.y - m.base[:, 1, None]).square()
+    standing = find_standing(heights, known, m.base, square.unflatten(1, size))
     first, reached = choose_ground(heights, known, standing, cfg.grid, own, is_readable(state.elevation))
-    levels, state, changed = swap(levels, state, first)
+    levels, state, changed = swap(levels, state, first.flatten(1), cfg)
     if cfg.overlap is not None:
-        strange = state.validity & ~reached & ~changed & (state.time > 0) & standing.found[:, None, None]
-        strange = strange & ((state.elevation - standing.height[:, None, None]).abs() > cfg.overlap.height)
+        strange = state.validity & ~reached.flatten(1) & ~changed & (state.time > 0) & standing.found[:, None]
+        strange = strange & ((state.elevation - standing.height[:, None]).abs() > cfg.overlap.height)
         strange = strange & (square <= cfg.overlap.radius**2)
-        found = Found(*(part.unflatten(1, state.elevation.shape[1:]) for part in _as_found(state, own)))
-        levels, _ = insert(levels, strange, found, state.time)
-        state = state._replace(validity=state.validity & ~strange)
+        levels, _ = insert(levels, strange, _as_found(state, cfg), state.time)
+        state = _forget_ground(state, strange)
     return levels, state, changed
 
 
 def swap(
-    levels: Levels, state: MapState, surface: Tensor
-) -> tuple[Levels, MapState, Bool[Tensor, "B H W"]]:
+    levels: Levels, state: MapState, surface: Int[Tensor, "B cells"], cfg: ElevationMapConfig
+) -> tuple[Levels, MapState, Bool[Tensor, "B cells"]]:
     """Exchange the ground of each cell with the level `surface` - 1, where that is one; return where."""
-    changed = surface > 0
-    at = (surface - 1).clamp(min=0)[:, None]
-    lower, upper, variance, support, time = (getattr(levels, name).gather(1, at)[:, 0] for name in levels._fields[:5])
-    placed = torch.zeros_like(levels.support, dtype=torch.bool).scatter(1, at, changed[:, None])
-    old = dict(
-        lower=state.elevation,
-        upper=state.elevation,
-        variance=state.variance,
-        support=torch.where(state.validity, state.support.clamp(min=1.0), 0.0),
-        time=state.time,
-    )
-    old = {name: torch.where(state.validity, value, 0.0) for name, value in old.items()}
+    changed, level = surface > 0, surface - 1
+    ground = _as_found(state, cfg)
+    support = state.support.clamp(min=1.0)
+    old = dict(lower=ground.mean, upper=ground.mean, variance=ground.variance, support=support, time=state.time)
+    was_known = changed & state.validity
+    levels, state = found_ground(levels, state, level.clamp(min=NONE))
+    place = torch.zeros_like(levels.support, dtype=torch.bool)
+    place = place.scatter(1, level.clamp(min=0)[:, None], was_known[:, None])
     levels = levels._replace(
-        **{name: torch.where(placed, value[:, None], getattr(levels, name)) for name, value in old.items()},
+        **{name: torch.where(place, value[:, None], getattr(levels, name)) for name, value in old.items()},
         free_top=torch.where(changed, -torch.inf, levels.free_top),
     )
-    state = state._replace(
-        elevation=torch.where(changed, upper, state.elevation),
-        variance=torch.where(changed, variance, state.variance),
-        support=torch.where(changed, support, state.support),
-        time=torch.where(changed, time, state.time),
-        validity=state.validity | changed,
-        bounded=state.bounded & ~changed,
-        challenger_support=torch.where(changed, 0, state.challenger_support),
-    )
     return levels, state, changed
+
+
+def found_ground(levels: Levels, state: MapState, level: Int[Tensor, "B cells"]) -> tuple[Levels, MapState]:
+    """Make a level the ground of each cell, whatever that was; NONE: it stays."""
+    founds, at = level >= 0, level.clamp(min=0)[:, None]
+    upper, variance, support, time = (
+        getattr(levels, name).gather(1, at)[:, 0] for name in ("upper", "variance", "support", "time")
+    )
+    variance = variance + state.statistics.disagreement.square()[:, None]
+    state = state._replace(
+        elevation=torch.where(founds, upper, state.elevation),
+        variance=torch.where(founds, variance, state.variance),
+        support=torch.where(founds, support, state.support),
+        time=torch.where(founds, time, state.time),
+        validity=state.validity | founds,
+        bounded=state.bounded & ~founds,
+        challenger_support=torch.where(founds, 0, state.challenger_support),
+    )
+    gone = torch.zeros_like(levels.support, dtype=torch.bool).scatter(1, at, founds[:, None])
+    return remove(levels, gone), state

@@ -80,9 +80,13 @@ def by_level(name: str, level: int, surfaces: View) -> Layer:
         ValueError: if no cell has so many surfaces.
     """
     K = surfaces.lower.shape[1]
-    require(name in BY_LEVEL, "layer", "must be one of a level", repr(name), f"there are {', '.join(BY_LEVEL)}", KeyError)
+    require(
+        name in BY_LEVEL, "layer", "must be one of a level", repr(name), f"there are {', '.join(BY_LEVEL)}", KeyError
+    )
     is_level = isinstance(level, int) and not isinstance(level, bool) and 0 <= level < K
-    require(is_level, "level", f"must be a whole number from 0, the lowest, to {K - 1}", repr(level), "count from below")
+    require(
+        is_level, "level", f"must be a whole number from 0, the lowest, to {K - 1}", repr(level), "count from below"
+    )
     order = torch.where(surfaces.known, surfaces.upper, torch.inf).argsort(stable=True, dim=1)[:, level, None]
     known = surfaces.known.gather(1, order)[:, 0]
     if name == "validity":

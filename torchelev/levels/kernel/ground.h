@@ -4,6 +4,7 @@
 #include <cmath>
 #include <cstdint>
 #include <limits>
+#include <utility>
 #include <vector>
 
 namespace levels {
@@ -18,59 +19,75 @@ struct Standing {
     bool found = false;
 };
 
-// Memory of the search, kept between updates.
+// The search over the surfaces of a window, whose rim of cells without any spares the questions for its border. Its
+// memory is kept between updates.
 struct Search {
-    std::vector<float> height;    // (K, H W) [m] NaN: no surface
-    std::vector<float> guess;     // (H W) [m]
-    std::vector<int32_t> blind;   // (H W) cells since the last surface
-    std::vector<int32_t> reached_in;  // (H W) the step in which the guess came
-    std::vector<int32_t> decided_in;  // (H W) the step in which the cell was reached first
-    std::vector<uint16_t> open;   // (H W) surfaces that were not reached, a bit each; bit K: the guess
-    std::vector<int8_t> first;    // (H W)
-    std::vector<int32_t> wave, next;  // surface * cells + cell
+    std::vector<float> height;        // (K, cells) [m] NaN: no surface
+    std::vector<float> guess;         // (cells) [m]
+    std::vector<int32_t> blind;       // (cells) cells since the last surface
+    std::vector<int32_t> decided_in;  // (cells) the step in which a cell of several surfaces was reached first
+    std::vector<uint16_t> open;       // (cells) surfaces that were not reached, a bit each, and flags
+    std::vector<int8_t> first;        // (cells)
+    std::vector<int32_t> wave, next;  // nodes: surface << SHIFT | cell
 
-    int64_t H, W, cells;
+    int64_t H, W, pitch, cells;
     int K;
     float max_step, rise;
     int32_t max_blind;
     int32_t step = 0;
+    static constexpr int SHIFT = 27;
+    // Bits of `open`: the guess was not reached; it came in this step; the cell may be reached on several surfaces.
+    static constexpr uint16_t GUESS = 1 << 13, FRESH = 1 << 14, SEVERAL = 1 << 15;
 
     void start(int64_t rows, int64_t columns, int surfaces) {
-        H = rows, W = columns, cells = H * W, K = surfaces;
-        height.resize(K * cells), guess.resize(cells), blind.resize(cells), open.resize(cells);
-        reached_in.assign(cells, -1), decided_in.assign(cells, -1), first.assign(cells, UNDECIDED);
+        H = rows, W = columns, pitch = W + 2, cells = (H + 2) * pitch, K = surfaces;
+        height.assign(K * cells, NAN), guess.resize(cells), blind.resize(cells), open.resize(cells);
+        decided_in.resize(cells), first.assign(cells, UNDECIDED);
+        if (next.size() <= size_t(K + 1) * cells) wave.resize((K + 1) * cells + 1), next.resize((K + 1) * cells + 1);
     }
+
+    // The cell of a row and a column of the window.
+    int64_t at(int64_t i, int64_t j) const { return (i + 1) * pitch + j + 1; }
 
     // Find the highest surface below the base in the cell nearest to it that has one.
     Standing find_standing(const float* base, const float* x, const float* y) const {
         const int64_t i = nearest_of(x, H, base[0]), j = nearest_of(y, W, base[1]);
         constexpr int64_t NEAR = 8;
-        float square = std::numeric_limits<float>::infinity();
+        float square;
         Standing best = search(base, x, y, i - NEAR, i + NEAR, j - NEAR, j + NEAR, square);
-        const float reach = std::min(std::fabs(x[1] - x[0]), 1e9f) * (NEAR - 1);
+        const float reach = H > 1 ? (x[1] - x[0]) * (NEAR - 1) : 0;
         if (!best.found || square > reach * reach) best = search(base, x, y, 0, H - 1, 0, W - 1, square);
         return best;
     }
 
-    void run(const Standing& standing) {
-        for (int64_t c = 0; c < cells; c++) {
-            uint16_t bits = 0;
-            for (int k = 0; k < K; k++) bits |= uint16_t(height[k * cells + c] == height[k * cells + c]) << k;
-            open[c] = bits & 1 ? bits : uint16_t(bits | 1 << K);
-        }
-        wave.clear(), step = 0;
-        if (standing.found) reach(standing.surface, standing.cell, wave);
-        for (step = 1; step <= H + W && !wave.empty(); step++) {
-            next.clear();
-            for (const int32_t node : wave) spread(node / cells, node % cells);
+    // Search until the cells of several surfaces are reached; `is_whole`: until all are.
+    void run(const Standing& standing, bool is_whole) {
+        std::fill(open.begin(), open.end(), uint16_t(0));
+        int64_t several = 0;
+        for (int64_t i = 0; i < H; i++)
+            for (int64_t c = at(i, 0); c < at(i, W); c++) {
+                uint16_t bits = 0;
+                for (int k = 0; k < K; k++) bits |= uint16_t(height[k * cells + c] == height[k * cells + c]) << k;
+                open[c] = uint16_t(bits | (bits & 1 ? 0 : GUESS) | (bits > 1 ? SEVERAL : 0));
+                several += bits > 1;
+            }
+        step = 0, number = 0, undecided = several, fresh.clear();
+        if (standing.found) reach(standing.surface, standing.cell);
+        for (step = 1; step <= H + W && number && (undecided || is_whole); step++) {
             wave.swap(next);
+            spread(std::exchange(number, 0));
+            for (const int32_t c : fresh) open[c] &= uint16_t(~FRESH);
+            fresh.clear();
         }
-        for (int8_t& surface : first) surface = surface == UNDECIDED ? NONE : surface;
     }
 
     bool is_reached(int64_t c) const { return !(open[c] & 1) && height[c] == height[c]; }
 
   private:
+    int64_t number = 0;          // of nodes in `next`
+    int64_t undecided = 0;       // cells of several surfaces that were not reached
+    std::vector<int32_t> fresh;  // cells whose guess came in this step
+
     static int64_t nearest_of(const float* centers, int64_t size, float value) {
         int64_t best = 0;
         for (int64_t k = 1; k < size; k++)
@@ -87,42 +104,58 @@ struct Search {
                 const float dx = x[i] - base[0], dy = y[j] - base[1], away = dx * dx + dy * dy;
                 if (!(away < square)) continue;
                 for (int k = 0; k < K; k++) {
-                    const float h = height[k * cells + i * W + j];
+                    const float h = height[k * cells + at(i, j)];
                     if (!(h <= base[2]) || (away == square && !(h > best.height))) continue;
-                    best = {i * W + j, k, h, true}, square = away;
+                    best = {at(i, j), k, h, true}, square = away;
                 }
             }
         return best;
     }
 
-    void reach(int k, int64_t c, std::vector<int32_t>& to) {
-        open[c] &= uint16_t(~(1 << k)), to.push_back(int32_t(k * cells + c));
+    void reach(int k, int64_t c) {
+        open[c] &= uint16_t(~(k == K ? GUESS : 1 << k)), next[number++] = int32_t(k) << SHIFT | int32_t(c);
+        if (!(open[c] & SEVERAL)) return;
         const int8_t surface = k == K ? NONE : int8_t(k);
-        if (first[c] == UNDECIDED) first[c] = surface, decided_in[c] = step;
+        if (first[c] == UNDECIDED) first[c] = surface, decided_in[c] = step, undecided--;
         else if (decided_in[c] == step && surface != NONE && (first[c] == NONE || surface < first[c])) first[c] = surface;
     }
 
-    // Reach the cells beside one.
-    void spread(int64_t k, int64_t c) {
-        const float from = k < K ? height[k * cells + c] : guess[c];
-        const int32_t gone = k < K ? 0 : blind[c];
-        const float limit = max_step + rise * float(gone);
-        const int64_t i = c / W, j = c % W;
-        if (i > 0) visit(c - W, from, gone, limit);
-        if (i < H - 1) visit(c + W, from, gone, limit);
-        if (j > 0) visit(c - 1, from, gone, limit);
-        if (j < W - 1) visit(c + 1, from, gone, limit);
+    // Reach the cells beside those of the first `size` nodes of the wave.
+    void spread(int64_t size) {
+        const float* const ground = height.data();
+        const int32_t* const nodes = wave.data();
+        uint16_t* const left = open.data();
+        int32_t* const to = next.data();
+        const int64_t aside[] = {-pitch, pitch, -1, 1};
+        int64_t count = 0;
+        for (int64_t n = 0; n < size; n++) {
+            const int k = nodes[n] >> SHIFT;
+            const int64_t c = nodes[n] & ((1 << SHIFT) - 1);
+            const float from = k < K ? height[k * cells + c] : guess[c];
+            const int32_t gone = k < K ? 0 : blind[c];
+            const float limit = max_step + rise * float(gone);
+            for (const int64_t away : aside) {
+                const int64_t beside = c + away;
+                const uint16_t bits = left[beside];
+                if (bits & ~1) {
+                    number = count, visit(beside, from, gone, limit), count = number;
+                } else {  // mostly: the ground alone, or nothing, without a branch
+                    const bool reaches = (bits & 1) & (std::fabs(ground[beside] - from) <= limit);
+                    to[count] = int32_t(beside), count += reaches, left[beside] = uint16_t(bits ^ reaches);
+                }
+            }
+        }
+        number = count;
     }
 
     void visit(int64_t c, float from, int32_t gone, float limit) {
-        if (!open[c] && reached_in[c] != step) return;
-        for (int k = 0; k < K; k++)
-            if ((open[c] >> k & 1) && std::fabs(height[k * cells + c] - from) <= limit) reach(k, c, next);
+        for (int k = 0; k < (gone ? 1 : K); k++)  // what is guessed leads to the ground alone
+            if ((open[c] >> k & 1) && std::fabs(height[k * cells + c] - from) <= limit) reach(k, c);
         if (gone >= max_blind) return;
-        if (open[c] >> K & 1) {
-            guess[c] = from, blind[c] = gone + 1, reached_in[c] = step;
-            reach(K, c, next);
-        } else if (reached_in[c] == step) {
+        if (open[c] & GUESS) {
+            guess[c] = from, blind[c] = gone + 1;
+            reach(K, c), open[c] |= FRESH, fresh.push_back(int32_t(c));
+        } else if (open[c] & FRESH) {
             blind[c] = from < guess[c] ? gone + 1 : from == guess[c] ? std::min(blind[c], gone + 1) : blind[c];
             guess[c] = std::min(guess[c], from);
         }

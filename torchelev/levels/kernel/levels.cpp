@@ -22,6 +22,7 @@ struct Scratch {
     std::vector<float> bottom, top;            // (H W) [m] of the scan's points
     std::vector<int32_t> number, list;         // (H W) of the scan's points; place in `complex`, -1 for none
     std::vector<uint8_t> all_above, changed;   // (H W)
+    std::vector<uint8_t> simple;               // of `touched`
     std::vector<int32_t> touched, complex, first, sorted;
     levels::Search search;
 };
@@ -72,7 +73,7 @@ struct Map {
     // Places in the ring -------------------------------------------------------------------------------------------
 
     static int64_t ring(int64_t k, int64_t size) { return ((k % size) + size) % size; }
-    int64_t place(int64_t c) const { return row[c / u.W] + column[c % u.W]; }
+    int64_t place(int64_t c) const { return row[int32_t(c) / int32_t(u.W)] + column[int32_t(c) % int32_t(u.W)]; }
 
     Cell cell_at(int64_t p) const {
         const int64_t first = b * u.L * cells + p;
@@ -128,7 +129,7 @@ struct Map {
             const int64_t blocks = (u.N + BLOCK - 1) / BLOCK;
             parts(blocks, [&](int64_t, int64_t begin, int64_t end) {
                 for (int64_t k = begin; k < end; k++)
-                    measure_block(s * u.N + k * BLOCK, std::min(BLOCK, u.N - k * BLOCK), frame);
+                    measure_block(s * u.N + k * BLOCK, std::min(BLOCK, u.N - k * BLOCK), frame, sights.size);
             });
         }
         const int64_t* anchor = origin.anchor;
@@ -142,13 +143,15 @@ struct Map {
         }
     }
 
-    void measure_block(int64_t begin, int64_t number, const places::Frame& given) {
-        const places::Frame frame = given;  // a copy that nothing else can change: the loops become vectors
+    void measure_block(int64_t begin, int64_t number, const places::Frame& of_sensor, const levels::SightGrid& of_map) {
+        const places::Frame frame = of_sensor;  // copies that nothing else can change: the loops become vectors
+        const levels::SightGrid size = of_map;
         const int64_t first = b * M + begin;
         const float *p = u.points + 3 * first, *variance = u.variance ? u.variance + first : nullptr;
         const uint8_t* is_own = u.own ? u.own + first : nullptr;
         float x[BLOCK] = {}, y[BLOCK] = {}, z[BLOCK] = {}, ax[BLOCK], ay[BLOCK], az[BLOCK], noise[BLOCK];
-        int32_t cell[BLOCK];
+        float rho[BLOCK], slope[BLOCK];
+        int32_t cell[BLOCK], direction[BLOCK], reach[BLOCK];
         uint8_t casts[BLOCK], above[BLOCK] = {};
         for (int64_t n = 0; n < number; n++) x[n] = p[3 * n], y[n] = p[3 * n + 1], z[n] = p[3 * n + 2];
         for (int64_t n = 0; n < BLOCK; n++) {
@@ -164,10 +167,19 @@ struct Map {
             casts[n] &= !frame.is_inside(ax[n], ay[n], az[n], u.box);
         for (int64_t n = 0; is_own && n < number; n++) casts[n] &= !is_own[n];
         for (int64_t n = 0; u.has_ramp && n < BLOCK; n++) above[n] = frame.is_above(ax[n], ay[n], az[n], u.ramp);
+        for (int64_t n = 0; n < BLOCK; n++) {
+            const float dx = casts[n] ? ax[n] - frame.t[0] : 0, dy = casts[n] ? ay[n] - frame.t[1] : 0;
+            const float dz = casts[n] ? az[n] - frame.t[2] : 0;
+            const int32_t azimuth = size.azimuth_bin(dx, dy);
+            rho[n] = levels::horizontal(dx, dy), slope[n] = dz / std::max(rho[n], 1e-12f);
+            direction[n] = size.elevation_bin(rho[n], dz) * size.azimuths + azimuth;
+            reach[n] = size.range_bin(rho[n]) * size.azimuths + azimuth;
+        }
         Points& to = own.points;
         for (int64_t n = 0; n < number; n++) {
             const int64_t m = begin + n;
-            to.x[m] = ax[n], to.y[m] = ay[n], to.z[m] = az[n], to.noise[m] = noise[n];
+            to.z[m] = az[n], to.noise[m] = noise[n], to.rho[m] = rho[n], to.slope[m] = slope[n];
+            to.direction[m] = direction[n], to.reach[m] = reach[n];
             to.cell[m] = casts[n] ? cell[n] : -1, to.casts[m] = casts[n], to.above[m] = above[n];
         }
     }
@@ -207,6 +219,7 @@ struct Map {
     // Sorting points into surfaces -------------------------------------------------------------------------------
 
     bool floats(int64_t c, float top) const {
+        if (!(own.lowest[c] < top - levels::HEIGHTS[0] * u.min_gap)) return false;  // mostly
         return sights.floats(own.x[c / u.W], own.y[c % u.W], top, own.lowest[c]);
     }
 
@@ -231,8 +244,13 @@ struct Map {
     void sort_points() {
         std::fill_n(u.aside + b * M, M, 0);
         own.list.assign(cells, -1), own.complex.clear(), own.first.assign(1, 0);
-        for (const int32_t c : own.touched) {
-            if (is_simple(c)) continue;
+        own.simple.resize(own.touched.size());
+        parts(int64_t(own.touched.size()), [&](int64_t, int64_t begin, int64_t end) {
+            for (int64_t k = begin; k < end; k++) own.simple[k] = is_simple(own.touched[k]);
+        });
+        for (size_t k = 0; k < own.touched.size(); k++) {
+            const int32_t c = own.touched[k];
+            if (own.simple[k]) continue;
             own.list[c] = int32_t(own.complex.size()), own.complex.push_back(c);
             own.first.push_back(own.first.back() + own.number[c]);
         }
@@ -338,27 +356,33 @@ struct Map {
 
     // Merge surfaces that meet, and clear those that rays passed through; note the highest rays.
     void tidy() {
-        for (int64_t i = 0; i < u.H; i++)
-            for (int64_t j = 0; j < u.W; j++) {
-                const int64_t c = i * u.W + j, p = row[i] + column[j];
-                free_top(p) = std::max(free_top(p), own.highest[c]);
-                if (has_levels(p)) tidy_cell(c, p);
-            }
+        std::atomic<int64_t> merged{0}, cleared{0};
+        parts(u.H, [&](int64_t, int64_t begin, int64_t end) {
+            int64_t of_part[levels::STATISTICS] = {};
+            for (int64_t i = begin; i < end; i++)
+                for (int64_t j = 0; j < u.W; j++) {
+                    const int64_t c = i * u.W + j, p = row[i] + column[j];
+                    free_top(p) = std::max(free_top(p), own.highest[c]);
+                    if (has_levels(p)) tidy_cell(c, p, of_part);
+                }
+            merged += of_part[levels::MERGED], cleared += of_part[levels::CLEARED];
+        });
+        statistics[levels::MERGED] += merged, statistics[levels::CLEARED] += cleared;
     }
 
-    void tidy_cell(int64_t c, int64_t p) {
+    void tidy_cell(int64_t c, int64_t p, int64_t* numbers) const {
         const Cell cell = cell_at(p);
-        statistics[levels::MERGED] += cell.merge();
+        numbers[levels::MERGED] += cell.merge();
         const float g = u.elevation[b * cells + c];
         for (int64_t l = 0; l < u.L; l++) {
             const int64_t q = l * cells;
             if (!(cell.support[q] > 0)) continue;
             if (u.validity[b * cells + c] && levels::distance(cell.lower[q], cell.upper[q], g, g) < 0.5f * u.min_gap) {
-                cell.remove(l), statistics[levels::MERGED]++;
+                cell.remove(l), numbers[levels::MERGED]++;
             } else if (cell.time[q] > u.min_time) {
                 for (const levels::Sight& sight : own.sights)
                     if (sight.passes(own.x[c / u.W], own.y[c % u.W], cell.lower[q], cell.upper[q], cell.variance[q], sights.size)) {
-                        cell.remove(l), statistics[levels::CLEARED]++;
+                        cell.remove(l), numbers[levels::CLEARED]++;
                         break;
                     }
             }
@@ -373,48 +397,61 @@ struct Map {
         search.max_step = u.max_step, search.rise = float(levels::SLOPE * u.resolution), search.max_blind = u.max_blind;
         bool any = false;
         const float least = std::max(u.min_support, 0.5f);
-        for (int64_t i = 0; i < u.H; i++)
-            for (int64_t j = 0; j < u.W; j++) {
-                const int64_t c = i * u.W + j, p = row[i] + column[j];
-                search.height[c] = u.validity[b * cells + c] ? u.elevation[b * cells + c] : NAN;
-                for (int64_t l = 0; l < u.L; l++) {
-                    const int64_t q = (b * u.L + l) * cells + p;
-                    const bool is_there = u.support[q] >= least;
-                    search.height[(l + 1) * cells + c] = is_there ? u.upper[q] : NAN, any |= is_there;
+        for (int64_t i = 0; i < u.H; i++) {
+            const int64_t n = b * cells + i * u.W;
+            float* to = &search.height[search.at(i, 0)];
+            for (int64_t j = 0; j < u.W; j++) to[j] = u.validity[n + j] ? u.elevation[n + j] : NAN;
+            for (int64_t l = 0; l < u.L; l++) {
+                const int64_t q = (b * u.L + l) * cells + row[i];
+                to += search.cells;
+                for (int64_t j = 0; j < u.W; j++) {
+                    const bool is_there = u.support[q + column[j]] >= least;
+                    if (is_there) to[j] = u.upper[q + column[j]], any = true;
                 }
             }
+        }
         const levels::Standing standing = search.find_standing(base, own.x.data(), own.y.data());
-        if (!any && !has_strange(standing)) return;
-        search.run(standing);
+        const bool strange = has_strange(standing);
+        if (!any && !strange) return;
+        search.run(standing, strange);
         own.changed.assign(cells, 0);
-        for (int64_t c = 0; c < cells; c++)
-            if (search.first[c] > 0) swap(c, search.first[c] - 1), own.changed[c] = 1, statistics[levels::CHOSEN]++;
-        demote_strange(standing);
+        for (int64_t i = 0; i < u.H; i++)
+            for (int64_t j = 0; j < u.W; j++) {
+                const int64_t c = i * u.W + j;
+                const int surface = search.first[search.at(i, j)];
+                if (surface > 0) swap(c, surface - 1), own.changed[c] = 1, statistics[levels::CHOSEN]++;
+            }
+        if (strange) demote_strange(standing);
     }
 
-    // Whether a cell near the robot is of another floor, if it cannot be reached.
-    bool is_strange(int64_t c, const levels::Standing& standing) const {
-        const int64_t n = b * cells + c;
-        if (!u.validity[n] || !(u.ground_time[n] > 0)) return false;
-        const float x = own.x[c / u.W] - base[0], y = own.y[c % u.W] - base[1];
-        return std::fabs(u.elevation[n] - standing.height) > u.overlap_height &&
-               x * x + y * y <= u.overlap_radius * u.overlap_radius;
-    }
-
-    bool has_strange(const levels::Standing& standing) const {
+    // Call `work(c, i, j)` for the cells near the robot whose height is of another floor, until it returns true.
+    template <class Work> bool for_strange(const levels::Standing& standing, const Work& work) const {
         if (!standing.found || u.overlap_radius <= 0) return false;
-        for (int64_t c = 0; c < cells; c++)
-            if (is_strange(c, standing)) return true;
+        const float square = u.overlap_radius * u.overlap_radius;
+        for (int64_t i = 0; i < u.H; i++) {
+            const float x = own.x[i] - base[0];
+            if (x * x > square) continue;
+            for (int64_t j = 0; j < u.W; j++) {
+                const int64_t n = b * cells + i * u.W + j;
+                if (!(std::fabs(u.elevation[n] - standing.height) > u.overlap_height) || !u.validity[n]) continue;
+                const float y = own.y[j] - base[1];
+                if (u.ground_time[n] > 0 && x * x + y * y <= square && work(i * u.W + j, i, j)) return true;
+            }
+        }
         return false;
     }
 
+    bool has_strange(const levels::Standing& standing) const {
+        return for_strange(standing, [](int64_t, int64_t, int64_t) { return true; });
+    }
+
     void demote_strange(const levels::Standing& standing) {
-        if (!standing.found || u.overlap_radius <= 0) return;
-        for (int64_t c = 0; c < cells; c++) {
-            if (own.changed[c] || own.search.is_reached(c) || !is_strange(c, standing)) continue;
-            cell_at(place(c)).insert(ground_of(c), u.ground_time[b * cells + c]);
+        for_strange(standing, [&](int64_t c, int64_t i, int64_t j) {
+            if (own.changed[c] || own.search.is_reached(own.search.at(i, j))) return false;
+            cell_at(row[i] + column[j]).insert(ground_of(c), u.ground_time[b * cells + c]);
             forget_ground(c);
-        }
+            return false;
+        });
     }
 
     // Exchange the ground of a cell with a level.

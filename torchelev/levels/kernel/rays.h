@@ -29,40 +29,44 @@ struct SightGrid {
         const int32_t bin = int32_t(visibility::azimuth_fraction(x, y) * float(azimuths));
         return std::min(bin, azimuths - 1);
     }
+    int32_t range_bin(float rho) const { return std::min(int32_t(rho / resolution), ranges - 2); }
     int32_t elevation_bin(float rho, float dz) const {
         const float fraction = 0.5f + 0.5f * (dz / std::max(rho + std::fabs(dz), 1e-12f));
         return std::min(int32_t(fraction * float(elevations)), elevations - 1);
     }
 };
 
+struct Slopes {
+    float highest, lowest;
+};
+
 // What the rays of one sensor saw.
 struct Sight {
     float origin[3];
-    std::vector<float> nearest, highest, lowest;
+    std::vector<float> nearest;  // by direction
+    std::vector<Slopes> slopes;  // by range and azimuth
 
     void look_for_nearest(const Points& p, int64_t begin, int64_t end, const SightGrid& size) {
         nearest.assign(size_t(size.elevations) * size.azimuths, INFINITE);
         for (int64_t m = begin; m < end; m++) {
-            if (!p.casts[m]) continue;
-            const float x = p.x[m] - origin[0], y = p.y[m] - origin[1], rho = horizontal(x, y);
-            float& known = nearest[size.elevation_bin(rho, p.z[m] - origin[2]) * size.azimuths + size.azimuth_bin(x, y)];
-            known = std::min(known, rho);
+            float& known = nearest[p.direction[m]];
+            known = std::min(known, p.casts[m] ? p.rho[m] : INFINITE);
         }
     }
 
     void look_for_slopes(const Points& p, int64_t begin, int64_t end, const SightGrid& size) {
-        const int64_t A = size.azimuths, R = size.ranges;
-        highest.assign(R * A, -INFINITE), lowest.assign(R * A, INFINITE);
+        const int64_t A = size.azimuths;
+        slopes.assign(int64_t(size.ranges) * A, {-INFINITE, INFINITE});
         for (int64_t m = begin; m < end; m++) {
-            const float x = p.x[m] - origin[0], y = p.y[m] - origin[1], rho = horizontal(x, y);
-            if (!p.casts[m] || !(rho > 0)) continue;
-            const float slope = (p.z[m] - origin[2]) / std::max(rho, 1e-12f);
-            const int64_t k = std::min(int64_t(rho / size.resolution), R - 1) * A + size.azimuth_bin(x, y);
-            highest[k] = std::max(highest[k], slope), lowest[k] = std::min(lowest[k], slope);
+            if (!p.casts[m] || !(p.rho[m] > 0)) continue;
+            Slopes& known = slopes[p.reach[m]];
+            known.highest = std::max(known.highest, p.slope[m]), known.lowest = std::min(known.lowest, p.slope[m]);
         }
-        for (int64_t k = (R - 1) * A - 1; k >= 0; k--) {
-            highest[k] = std::max(highest[k], highest[k + A]);
-            lowest[k] = std::min(lowest[k], lowest[k + A]);
+        for (int64_t row = size.ranges - 3; row >= 0; row--) {  // the last row stays blank
+            Slopes* __restrict to = &slopes[row * A];
+            const Slopes* far = to + A;
+            for (int64_t k = 0; k < A; k++)
+                to[k] = {std::max(to[k].highest, far[k].highest), std::min(to[k].lowest, far[k].lowest)};
         }
     }
 
@@ -130,8 +134,8 @@ struct Sights {
                     place[n] = row * size.azimuths + size.azimuth_bin(dx, dy);
                 }
                 for (int64_t n = 0; n < number; n++) {
-                    const float up = sight.origin[2] + sight.highest[place[n]] * d[n];
-                    const float down = sight.origin[2] + sight.lowest[place[n]] * d[n];
+                    const float up = sight.origin[2] + sight.slopes[place[n]].highest * d[n];
+                    const float down = sight.origin[2] + sight.slopes[place[n]].lowest * d[n];
                     highest[first + n] = std::max(highest[first + n], up);
                     lowest[first + n] = std::min(lowest[first + n], down);
                 }

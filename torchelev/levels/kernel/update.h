@@ -42,13 +42,16 @@ enum Statistic { OPENED, CLEARED, MERGED, DROPPED, CHOSEN, STATISTICS };
 
 // A scan's points of one map, M = S * N, in map axes.
 struct Points {
-    std::vector<float> x, y, z, noise;  // [m] from the anchor, [m^2]
-    std::vector<int32_t> cell;          // of the window, -1 outside or where the point does not count
-    std::vector<uint8_t> casts, above;  // its ray counts; it lies above the exclusion ramp
+    std::vector<float> z, noise;          // [m], [m^2]
+    std::vector<float> rho, slope;        // [m] horizontal range, and rise of the ray
+    std::vector<int32_t> direction, reach;  // entries of the ray in the tables of `Sight`
+    std::vector<int32_t> cell;            // of the window, -1 outside or where the point does not count
+    std::vector<uint8_t> casts, above;    // its ray counts; it lies above the exclusion ramp
 
     void resize(int64_t M) {
-        for (std::vector<float>* values : {&x, &y, &z, &noise}) values->resize(M);
-        cell.resize(M), casts.resize(M), above.resize(M);
+        for (std::vector<float>* values : {&z, &noise, &rho, &slope}) values->resize(M);
+        for (std::vector<int32_t>* values : {&direction, &reach, &cell}) values->resize(M);
+        casts.resize(M), above.resize(M);
     }
 };
 
