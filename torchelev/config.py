@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 class ElevationMapConfig:
     """Configuration of all stages of a map.
 
-    `drift`, `raycast`, `overlap`, `traversability`, `completion`, `levels` and `fusion.edges` can be None, which switches that
-    stage off.
+    `drift`, `raycast`, `overlap`, `traversability`, `completion`, `levels` and `fusion.edges` can be None, which
+    switches that stage off.
 
     Raises:
         TypeError: if a field has the wrong type.

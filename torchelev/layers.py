@@ -124,6 +124,19 @@ def containing_cells(uv: Float[Tensor, "B M 2"], grid: GridConfig) -> tuple[Int[
     return corners.cell, corners.counts
 
 
+def sample_lowest(layer: Layer, uv: Float[Tensor, "B M 2"], grid: GridConfig, mode: str) -> Layer:
+    """Sample a layer by the lowest of its known cells around each point, of which a mean would say too much.
+
+    Arguments and results are those of `sample_layer`; values may be infinite. "bilinear" looks at the four surrounding
+    cells, of which the known ones must carry half of the weight.
+    """
+    corners = _drop_unknown(_find_corners(uv, grid, mode), layer[1])
+    read = layer[0].flatten(1).gather(1, corners.cell)
+    lowest = torch.where(corners.counts, read, torch.inf).view_as(corners.weight).amin(1)
+    valid = corners.weight.sum(1) >= 0.5
+    return torch.where(valid, lowest, 0.0), valid
+
+
 def _find_corners(uv: Tensor, grid: GridConfig, mode: str) -> _Corners:
     finite = torch.isfinite(uv).all(-1, keepdim=True)
     far = min(1e6, torch.finfo(uv.dtype).max)

@@ -160,6 +160,10 @@ def as_inputs(values: Mapping[str, Tensor | None]) -> Inputs:
 
 
 _KINDS = {
-    name: torch.bool if name in ("own", "moving", "aside") else torch.float64 if name.startswith("T_") else torch.float32
+    name: torch.bool
+    if name in ("own", "moving", "aside")
+    else torch.float64
+    if name.startswith("T_")
+    else torch.float32
     for name in Inputs._fields
 }

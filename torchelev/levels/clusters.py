@@ -34,7 +34,7 @@ def find_clusters(
     num_cells: int,
     min_gap: float,
 ) -> Clusters:
-    """Cut the points of each cell, in the order of their heights, where two of them are more than `min_gap` [m] apart."""
+    """Cut the points of each cell, in the order of heights, where two of them are more than `min_gap` [m] apart."""
     slot, z = torch.where(counts, slot, num_cells), torch.where(counts, z, 0.0)
     order = z.argsort(stable=True, dim=1)
     order = order.gather(1, slot.gather(1, order).argsort(stable=True, dim=1))

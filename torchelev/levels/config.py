@@ -47,6 +47,11 @@ class LevelsConfig:
         return int(min(self.max_blind, 1e3) / grid.resolution)
 
     @property
+    def least_support(self) -> float:
+        """The support from which on a surface is there: `min_support`, and more than none."""
+        return max(self.min_support, 0.5)
+
+    @property
     def others(self) -> int:
         """How many surfaces a cell holds besides the ground, L = K - 1."""
         return self.max_levels - 1

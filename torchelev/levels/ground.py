@@ -74,7 +74,8 @@ def choose_ground(
     """Find the surface that each cell is first reached on, from cell to cell by steps of at most `max_step`.
 
     Ground that is not known is guessed to go on as it was, over at most `max_blind`; to ground beyond it, `SLOPE` adds
-    to the step. It never leads onto another surface: the floor behind a table's shadow is no way onto the table. All steps of a number come before those of the next, so the way is the shortest.
+    to the step. It never leads onto another surface: the floor behind a table's shadow is no way onto the table. Ways
+    of few steps come before longer ones, so the way is the shortest.
 
     Args:
         heights: of the ground and the other surfaces [m].

@@ -9,7 +9,17 @@ import torch
 from torch import Tensor, nn
 
 from torchelev.levels import native
-from torchelev.levels.state import SURFACE, Levels, LevelStatistics, blank_levels, move, raise_by, remove, turn
+from torchelev.levels.state import (
+    SURFACE,
+    Levels,
+    LevelStatistics,
+    blank_levels,
+    forget_space,
+    move,
+    raise_by,
+    remove,
+    turn,
+)
 from torchelev.levels.step import update_levels
 from torchelev.levels.views import View, view
 from torchelev.stages.measure.stage import measure
@@ -32,6 +42,9 @@ class MapLevels(nn.Module):
     """
 
     corner: Tensor
+    lower: Tensor
+    free_top: Tensor
+    is_open: Tensor
 
     def __init__(self, cfg: ElevationMapConfig, num_envs: int, device: torch.device | str) -> None:
         super().__init__()
@@ -114,15 +127,16 @@ class MapLevels(nn.Module):
     def forget(self, env_ids: Tensor | None, mask: Bool[Tensor, "B"] | None) -> None:
         """Forget the surfaces of some environments, or of all."""
         for name in SURFACE:
-            fill(getattr(self, name), 0.0, env_ids, mask)
+            fill(cast("Tensor", getattr(self, name)), 0.0, env_ids, mask)
         fill(self.free_top, -torch.inf, env_ids, mask)
+        fill(self.is_open, False, env_ids, mask)
 
     @torch.no_grad()
     def forget_cells(self, state: MapState, cells: Bool[Tensor, "B H W"]) -> None:
         """Forget the surfaces of some cells of the maps."""
         levels = self._of_maps(state)
         levels = remove(levels, cells[:, None].expand(levels.lower.shape))
-        self._write(levels._replace(free_top=torch.where(cells, -torch.inf, levels.free_top)), state.corner)
+        self._write(forget_space(levels, cells), state.corner)
 
     def view(self, state: MapState) -> View:
         """Return what is known of all surfaces, the ground of a state of the maps included."""

@@ -29,7 +29,7 @@ _GROUND = ("elevation", "variance", "validity", "support", "challenger_support",
 _ADDRESSES = (
     *("points", "T_map_sensor", "T_map_base", "variance", "own", "dt", "corner"),
     *(f"ground_{name}" for name in _GROUND),
-    *("disagreement", "before", *SURFACE, "free_top", "aside", "statistics"),
+    *("disagreement", "before", *(f"level_{name}" for name in SURFACE), "free_top", "is_open", "aside", "statistics"),
 )
 _SENSOR = ("noise_factor", "noise_floor", "min_distance", "max_distance")
 _NUMBERS = (
@@ -84,8 +84,8 @@ def update_in_cpp(
     numbers = torch.zeros(B, len(LevelStatistics._fields), dtype=torch.int64)
     variance = None if inputs.variance is None else inputs.variance.float()
     base = None if inputs.T_map_base is None else inputs.T_map_base.double()
-    given = (inputs.points.float(), inputs.T_map_sensor.double(), base, variance, find_own(inputs, cfg.sensor))
-    given = (*given, inputs.dt.float(), state.corner)
+    given: tuple[Tensor | None, ...] = (inputs.points.float(), inputs.T_map_sensor.double(), base, variance)
+    given = (*given, find_own(inputs, cfg.sensor), inputs.dt.float(), state.corner)
     read = [None if value is None else value.contiguous() for value in given]
     ground = (getattr(state, name) for name in _GROUND)
     tensors = (*read, *ground, state.statistics.disagreement, corner, *levels, aside, numbers)

@@ -1,7 +1,7 @@
 """What the rays of a scan passed through: the nearest return of each direction, and the highest ray over each cell.
 
-All rays of a sensor share an origin, so a direction is free up to its nearest return. Directions are bins of azimuth and
-elevation; a place is free only if all returns of the bins that cover it lie farther.
+All rays of a sensor share an origin, so a direction is free up to its nearest return. Directions are bins of azimuth
+and elevation; a place is free only if all returns of the bins that cover it lie farther.
 """
 
 from __future__ import annotations

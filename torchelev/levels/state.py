@@ -10,7 +10,7 @@ from torch import Tensor
 from torchelev.ops.moving import move_layers
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
+    from jaxtyping import Bool, Float, Int
 
 
 class Levels(NamedTuple):
@@ -25,7 +25,8 @@ class Levels(NamedTuple):
     variance: Float[Tensor, "B L H W"]  #: [m^2] of either height
     support: Float[Tensor, "B L H W"]  #: points that measured it; 0: the place is empty
     time: Float[Tensor, "B L H W"]  #: [s] since the last of them
-    free_top: Float[Tensor, "B H W"]  #: [m] height of the highest ray over the ground; -inf: none passed
+    free_top: Float[Tensor, "B H W"]  #: [m] height of the highest ray over the cell; -inf: none passed
+    is_open: Bool[Tensor, "B H W"]  #: rays passed close above the ground, and higher by `min_gap`: it is no wall's foot
 
 
 class LevelStatistics(NamedTuple):
@@ -45,17 +46,18 @@ def blank_levels(size: tuple[int, int, int, int], device: torch.device | str) ->
     """Return levels of which nothing is known; `size` is (B, L, H, W)."""
     zero = torch.zeros(size, device=device)
     free_top = torch.full((size[0], *size[2:]), -torch.inf, device=device)
-    return Levels(*(zero.clone() for _ in SURFACE), free_top)
+    is_open = torch.zeros_like(free_top, dtype=torch.bool)
+    return Levels(**{name: zero.clone() for name in SURFACE}, free_top=free_top, is_open=is_open)
 
 
 def move(levels: Levels, shift: Int[Tensor, "B 2"]) -> Levels:
     """Return levels whose windows moved by whole cells; entering cells are blank."""
     layers = {f"{name}{k}": part for name in SURFACE for k, part in enumerate(getattr(levels, name).unbind(1))}
-    moved = move_layers(layers | {"free_top": levels.free_top}, shift, {"free_top": -torch.inf})
+    space = {"free_top": levels.free_top, "is_open": levels.is_open}
+    moved = move_layers(layers | space, shift, {"free_top": -torch.inf})
     L = levels.lower.shape[1]
-    return Levels(
-        *(torch.stack([moved[f"{name}{k}"] for k in range(L)], 1) for name in SURFACE), free_top=moved["free_top"]
-    )
+    parts = {name: torch.stack([moved[f"{name}{k}"] for k in range(L)], 1) for name in SURFACE}
+    return Levels(**parts, **{name: moved[name] for name in space})
 
 
 def turn(levels: Levels, corner: Int[Tensor, "B 2"], to_ring: bool) -> Levels:
@@ -92,6 +94,12 @@ def raise_by(levels: Levels, height: Float[Tensor, "B"]) -> Levels:
     return levels._replace(
         lower=levels.lower + step, upper=levels.upper + step, free_top=levels.free_top + height[:, None, None]
     )
+
+
+def forget_space(levels: Levels, cells: Tensor) -> Levels:
+    """Return levels without what rays showed of the space over some cells, (B, H, W) bool."""
+    free_top = torch.where(cells, -torch.inf, levels.free_top)
+    return levels._replace(free_top=free_top, is_open=levels.is_open & ~cells)
 
 
 def remove(levels: Levels, gone: Tensor) -> Levels:

@@ -22,7 +22,7 @@ from torchelev.levels.rays import (
     nearest_around,
     ray_heights,
 )
-from torchelev.levels.state import Levels, LevelStatistics, age, move, remove
+from torchelev.levels.state import Levels, LevelStatistics, age, forget_space, move, remove
 from torchelev.levels.surfaces import GATE, Found, distance, fuse, insert, merge
 from torchelev.ops.masks import count
 from torchelev.ops.transforms import is_readable
@@ -51,7 +51,8 @@ class _Scan(NamedTuple):
     """A scan over the window."""
 
     clusters: Clusters
-    hangs: Bool[Tensor, "B M"]  # clusters below which rays passed, or which were seen from below
+    floating: Bool[Tensor, "B M"]  # clusters below which rays passed
+    from_below: Bool[Tensor, "B M"]  # clusters above all sensors
     ground_floats: Bool[Tensor, "B cells"]
     sights: list[Sight]
     rays: RayHeights
@@ -87,7 +88,9 @@ def update_levels(
     levels = remove(levels, met)
     cleared = _seen_through(levels, scan, cfg)
     levels = remove(levels, cleared)
-    levels = levels._replace(free_top=torch.maximum(levels.free_top, scan.rays.highest))
+    highest, lowest = scan.rays
+    opens = state.validity & (lowest < state.elevation + 0.5 * own.min_gap) & (highest >= state.elevation + own.min_gap)
+    levels = levels._replace(free_top=torch.maximum(levels.free_top, highest), is_open=levels.is_open | opens)
     levels, state, changed = _choose(levels, state, m, scan, cfg)
     aside = inside & (aside | changed.gather(1, slot))
     return Step(
@@ -121,11 +124,10 @@ def _look_at(state: MapState, m: Measurement, slot: Tensor, inside: Tensor, cfg:
     clusters = find_clusters(*given, cfg.grid.num_cells, gap)
     place = clusters.slot.clamp(max=cfg.grid.num_cells - 1)
     rays, lower = ray_heights(sights, x, y, size), clusters.lower.clamp(max=1e6)
-    at = (values.gather(1, place) for values in (x, y))
-    hangs = floats(sights, *at, lower, rays.lowest.gather(1, place), gap, size)
-    hangs = hangs | (lower > m.origin[..., 2].amax(1)[:, None] + 0.5 * gap)  # seen from below
+    floating = floats(sights, x.gather(1, place), y.gather(1, place), lower, rays.lowest.gather(1, place), gap, size)
+    from_below = lower > m.origin[..., 2].amax(1)[:, None] + 0.5 * gap
     ground_floats = floats(sights, x, y, state.elevation.flatten(1), rays.lowest, gap, size)
-    return _Scan(clusters, hangs, ground_floats & state.validity.flatten(1), sights, rays, x, y)
+    return _Scan(clusters, floating, from_below, ground_floats & state.validity.flatten(1), sights, rays, x, y)
 
 
 def _sort_points(
@@ -140,14 +142,15 @@ def _sort_points(
     assert own is not None
     demoted = state.validity & scan.ground_floats & _shows_ground(clusters, state.elevation, own, num_cells)
     levels, lost = insert(levels, demoted, _as_found(state, cfg), state.time)
+    levels = levels._replace(is_open=levels.is_open & ~demoted)
     state, dropped, opened = _forget_ground(state, demoted), count(lost), count(demoted)
     aside_of = torch.zeros_like(clusters.slot, dtype=torch.bool)
     for rank in range(2 * own.max_levels):
         there = in_cells(clusters.number, clusters, rank, num_cells, 0.0)
         found = _found_of(clusters, rank, cfg)
-        ramp, hangs = (
+        ramp, flies, hangs = (
             in_cells(mask.to(there.dtype), clusters, rank, num_cells, 0.0) > 0
-            for mask in (clusters.above_ramp, scan.hangs)
+            for mask in (clusters.above_ramp, scan.floating, scan.floating | scan.from_below)
         )
         g, known = state.elevation, state.validity
         dg = torch.where(known, distance(found.lower, found.upper, g, g), torch.inf)
@@ -156,7 +159,7 @@ def _sort_points(
         to_ground = (dg <= own.min_gap) & (dg <= dl)
         to_level = (there > 0) & ~to_ground & (dl <= own.min_gap)
         above = known & (found.lower > g)
-        shown = torch.where(known & ~above, scan.ground_floats, hangs | (above & (levels.free_top >= g + own.min_gap)))
+        shown = torch.where(above, flies | levels.is_open, torch.where(known, scan.ground_floats, hangs))
         if own.separation == "gap":
             shown = shown | known | (rank > 0)
         opens = (there > 0) & ~to_ground & ~to_level & (shown | ramp)
@@ -250,7 +253,7 @@ def _choose(
     if m.base is None:
         return levels, state, torch.zeros_like(state.validity)
     heights = torch.cat([state.elevation[:, None], levels.upper], 1).unflatten(2, size)
-    known = torch.cat([state.validity[:, None], levels.support >= max(own.min_support, 0.5)], 1).unflatten(2, size)
+    known = torch.cat([state.validity[:, None], levels.support >= own.least_support], 1).unflatten(2, size)
     square = (scan.x - m.base[:, 0, None]).square() + (scan.y - m.base[:, 1, None]).square()
     standing = find_standing(heights, known, m.base, square.unflatten(1, size))
     first, reached = choose_ground(heights, known, standing, cfg.grid, own, is_readable(state.elevation))
@@ -260,7 +263,7 @@ def _choose(
         strange = strange & ((state.elevation - standing.height[:, None]).abs() > cfg.overlap.height)
         strange = strange & (square <= cfg.overlap.radius**2)
         levels, _ = insert(levels, strange, _as_found(state, cfg), state.time)
-        state = _forget_ground(state, strange)
+        levels, state = forget_space(levels, strange), _forget_ground(state, strange)
     return levels, state, changed
 
 
@@ -277,10 +280,9 @@ def swap(
     place = torch.zeros_like(levels.support, dtype=torch.bool)
     place = place.scatter(1, level.clamp(min=0)[:, None], was_known[:, None])
     levels = levels._replace(
-        **{name: torch.where(place, value[:, None], getattr(levels, name)) for name, value in old.items()},
-        free_top=torch.where(changed, -torch.inf, levels.free_top),
+        **{name: torch.where(place, value[:, None], getattr(levels, name)) for name, value in old.items()}
     )
-    return levels, state, changed
+    return forget_space(levels, changed), state, changed
 
 
 def found_ground(levels: Levels, state: MapState, level: Int[Tensor, "B cells"]) -> tuple[Levels, MapState]:

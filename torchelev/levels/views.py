@@ -46,7 +46,7 @@ def view(levels: Levels, state: MapState, cfg: ElevationMapConfig) -> View:
         upper=stack(state.elevation, levels.upper),
         variance=stack(absolute_variance(state), levels.variance),
         time=stack(state.time, levels.time),
-        known=stack(state.validity, levels.support >= max(cfg.levels.min_support, 0.5)),
+        known=stack(state.validity, levels.support >= cfg.levels.least_support),
         floor=torch.where(state.validity, state.elevation, state.upper_bound),
         has_floor=state.validity | state.bounded,
         free_top=levels.free_top,

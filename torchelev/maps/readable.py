@@ -11,7 +11,7 @@ from torchelev.channels.module import Channels
 from torchelev.config import ElevationMapConfig
 from torchelev.errors import require
 from torchelev.inputs import checks
-from torchelev.layers import LAYERS, MODES, Layer, sample_layer
+from torchelev.layers import LAYERS, MODES, Layer, sample_layer, sample_lowest
 from torchelev.levels import views
 from torchelev.levels.module import MapLevels
 from torchelev.maps.buffers import MapBuffers
@@ -131,8 +131,8 @@ class ReadableMap(MapBuffers):
           state and in the weights of `completion_net`.
         - a channel's, or `<channel>.<component>` of one with several, such as "rgb.red". The channel of several
           components itself is (B, C, H, W). Unknown where no point, and no image, said anything of the ground.
-        - ceiling [m], with `LevelsConfig`: the underside of the lowest surface above the ground, inf where rays met none,
-          NaN where nobody looked; clearance [m]: its height above the ground.
+        - ceiling [m], with `LevelsConfig`: the underside of the lowest surface above the ground, inf where rays met
+          none, NaN where nobody looked; clearance [m]: its height above the ground.
         - a configured filter's: computed when read, with the layers that it needs, and kept until the map changes.
 
         Args:
@@ -284,7 +284,8 @@ class ReadableMap(MapBuffers):
             xy: points, map frame [m].
             layer: one of `layers`.
             mode: "bilinear" renormalises over the known ones of the four surrounding cells, and is valid where these
-                carry at least half of the weight; "nearest" reads the cell that holds the point.
+                carry at least half of the weight; of ceilings and clearance it takes the lowest. "nearest" reads the
+                cell that holds the point.
             state: state to read; None: the map's own.
 
         Returns:
@@ -300,4 +301,5 @@ class ReadableMap(MapBuffers):
         require(mode in MODES, "mode", f"must be one of {', '.join(MODES)}", repr(mode), "use bilinear")
         corner = (self.state if state is None else state).corner
         uv = (xy.double() / self.cfg.grid.resolution - corner[:, None]).to(self.elevation.dtype)
-        return sample_layer(self.read_layer(layer, state), uv, self.cfg.grid, mode)
+        sample = sample_lowest if layer in views.LAYERS else sample_layer
+        return sample(self.read_layer(layer, state), uv, self.cfg.grid, mode)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchelev.config import ElevationMapConfig
 from torchelev.elevation_map import ElevationMap
-from torchelev.errors import require, whole_cells
+from torchelev.errors import require, require_positive, whole_cells
 from torchelev.grid import GridConfig
 from torchelev.layers import Layer
 from torchelev.observations import image_kernel, patterns
@@ -26,7 +26,10 @@ from torchelev.state import MapState
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-CHANNELS = ("elevation", "validity", "variance", "upper_bound", "traversability", "completed", "completed_std")
+CHANNELS = (
+    *("elevation", "validity", "variance", "upper_bound", "traversability", "completed", "completed_std"),
+    "clearance",
+)
 HEIGHTS = ("elevation", "upper_bound", "completed")  # they count from the ground below the base
 
 
@@ -44,6 +47,7 @@ class MapImage:
     - "validity", 1 where the elevation is known
     - "variance" [m^2]
     - "traversability", 0 (bad) to 1 (good)
+    - "clearance" [m] below the ceiling, at most `max_clearance`: maps whose config has a `LevelsConfig` know it
 
     After them come the components of `channels`, such as `MapImage(channels=("rgb", "terrain.stone"))`, each read in
     the cell that holds the pixel's centre.
@@ -64,6 +68,7 @@ class MapImage:
     alignment: str = "yaw"
     mode: str = "bilinear"  #: how the map is read: "bilinear", "nearest" or "minimum", as of `HeightScan`
     nominal_height: float = 0.0  #: [m] of the base over flat ground: that ground then has elevation 0
+    max_clearance: float = 3.0  #: [m] read where the clearance is larger, or nothing hangs above the ground
     _size: tuple[int, int] = field(init=False, repr=False, compare=False)  # H and W
     _pattern: Pattern = field(init=False, repr=False, compare=False)
 
@@ -74,6 +79,7 @@ class MapImage:
         hint = "correct their names, or give those of the map's channels as channels=(...)"
         require(are_layers, "layers", f"must be some of {', '.join(CHANNELS)}", repr(self.layers), hint)
         require_mode(self.mode)
+        require_positive(max_clearance=self.max_clearance)
         require(math.isfinite(self.nominal_height), "nominal_height", "must be finite", self.nominal_height, "give 0")
         axes = zip(self.offset, (H, W), strict=True)
         x, y = (patterns.space_around(middle, count, self.resolution) for middle, count in axes)
@@ -98,13 +104,16 @@ class MapImage:
 
         Raises:
             ValueError, TypeError: for a wrong shape, dtype or device, or a window too small for the image.
-            KeyError: for "completed" or "completed_std" of maps without completion, or channels that the maps lack.
+            KeyError: for layers of maps without completion or levels, or channels that the maps lack.
         """
         grid = emap.cfg.grid
         self._pattern.require_inside(grid)
         T_map_base = check_base(emap, T_map_base)
         current = emap.state if state is None else state
         layers = {name: emap.read_layer(name, state) for name in self._read_alone}
+        if "clearance" in layers:
+            clearance, known = layers["clearance"]
+            layers["clearance"] = clearance.clamp(max=self.max_clearance), known
         is_plain = len(set(self.layers)) == len(self.layers)
         if is_plain and image_kernel.can_read(T_map_base, current.corner, _tensors(layers, current)):
             images = image_kernel.read_images(

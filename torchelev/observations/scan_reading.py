@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
-from torchelev.layers import Layer
+from torchelev.layers import Layer, sample_lowest
 from torchelev.observations.channel_reading import read_channels
 from torchelev.observations.fill import ORIGINAL, Query, fill_unknown, filled_layers, read_points
 from torchelev.observations.inputs import ScanInputs, check_base, check_feet, draw_noise
@@ -41,7 +41,9 @@ def read_scan(
     current = emap.state if state is None else state
     inputs = ScanInputs(current, emap.cfg.grid, T_map_base, feet, draws)
     fill = scan.original if scan.fill == ORIGINAL else scan.fill
-    if can_read(fill, inputs):
+    if scan.surface == "ceiling":
+        heights = _read_ceiling(scan, emap, inputs, state)
+    elif can_read(fill, inputs):
         heights = read_in_cpp(scan, fill, _value_of_unknown(scan, fill), inputs)
     else:
         filled = filled_layers(fill, emap, state, scan.placement.half_extent(inputs.grid), scan.inpaint_rings)
@@ -58,6 +60,16 @@ def _place(scan: ScanSettings, inputs: ScanInputs) -> Float[Tensor, "B P 2"]:
     origin = inputs.T_map_base[:, None, :3, 3] if inputs.feet is None else inputs.feet
     state = inputs.state
     return scan.placement.place(inputs.T_map_base, origin, state.corner, inputs.grid.resolution, state.elevation.dtype)
+
+
+def _read_ceiling(scan: ScanSettings, emap: ElevationMap, inputs: ScanInputs, state: MapState | None) -> Layer:
+    """Read the heights of the ceiling above the base or the feet."""
+    ceiling, known = sample_lowest(emap.read_layer("ceiling", state), _place(scan, inputs), inputs.grid, scan.mode)
+    origin = inputs.T_map_base[:, None, :3, 3] if inputs.feet is None else inputs.feet
+    z = origin[..., 2:].to(ceiling.dtype).expand(-1, -1, len(scan.pattern)).flatten(1)
+    known = known & torch.isfinite(z)
+    value = torch.where(known, ceiling - z, torch.inf).clamp(max=scan.no_ceiling)
+    return _finish(scan, value, inputs.draws), known
 
 
 def _read(scan: ScanSettings, fill: str | float, layers: list[Layer], inputs: ScanInputs) -> Layer:

@@ -11,6 +11,8 @@ from torchelev.observations.channel_reading import count_rows, parse_channels
 from torchelev.observations.fill import FILLS, ORIGINAL, require_fill, require_mode
 from torchelev.observations.patterns import Pattern, Points, parse_points
 
+SURFACES = ("ground", "ceiling")
+
 
 @dataclass(frozen=True, kw_only=True)
 class ScanSettings:
@@ -31,6 +33,10 @@ class ScanSettings:
     - a number [m]: replaces z - elevation - nominal_height.
 
     Points for which "lowest", "upper_bound", "inpaint" or "completed" have no height read as with "base".
+
+    `surface="ceiling"` reads what is above instead, on maps with levels:
+
+    value = scale * clip(min(ceiling - z, no_ceiling) + noise, -clip, clip), by the lowest of the cells around a point.
 
     `channels` adds what else the map holds at the points, each read in the cell that holds the point, without scale,
     clip and noise: the heights are then the first of 1 + C rows.
@@ -58,6 +64,9 @@ class ScanSettings:
     #: of the map's config, by name: "rgb" for all its components, or "terrain.stone" for one
     channels: tuple[str, ...] = ()
     channel_fill: float = 0.0  #: value of channels in cells where they are unknown
+    #: "ground", or "ceiling": the height of the ceiling above z, on maps with levels; `clip` and `no_ceiling` limit it
+    surface: str = "ground"
+    no_ceiling: float = 2.0  #: [m] above z: read where the ceiling is unknown, higher, or not there
     placement: Pattern = field(init=False, repr=False, compare=False)  #: the pattern as it moves with the robot
 
     def __post_init__(self) -> None:
@@ -73,7 +82,9 @@ class ScanSettings:
         require(in_range, "standing_height", rule, repr(standing), hint)
         for name in ("nominal_height", "scale"):
             self._require_number(name, (int, float), "must be a finite number", -math.inf)
-        for name in ("noise", "reach"):
+        known = self.surface in SURFACES
+        require(known, "surface", f"must be one of {', '.join(SURFACES)}", repr(self.surface), "use ground")
+        for name in ("noise", "reach", "no_ceiling"):
             self._require_number(name, (int, float), "must be a finite number of at least 0", 0)
         for name in ("num_feet", "inpaint_rings"):
             self._require_number(name, (int,), "must be an int of at least 0", 0)

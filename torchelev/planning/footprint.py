@@ -12,7 +12,8 @@ from torch import Tensor
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, require_positive
 from torchelev.inputs.checks import given_or_default
-from torchelev.planning.ground_below import fit_below, read_ground
+from torchelev.planning.ceilings import too_low
+from torchelev.planning.ground_below import fit_below, read_ground, read_patches
 from torchelev.planning.limits import ROUNDING, limits_of
 from torchelev.planning.polygons import convex_hull
 from torchelev.state import MapState
@@ -39,6 +40,8 @@ class FootprintConfig:
     max_unsafe: float = 0.05  #: largest accepted fraction of unsafe cells; 0 accepts no unsafe cell at all
     max_unknown: float = 0.2  #: largest accepted fraction of cells unknown or outside the window; raise for sparse maps
     max_extent: float = 1.5  #: [m] largest accepted polygon along x and y; the cost grows with its square
+    #: [m] of the robot: cells below a lower ceiling are unsafe, on maps with levels; None: their `min_gap`
+    height: float | None = None
 
     def __post_init__(self) -> None:
         for name in ("min_traversability", "unsafe_traversability", "max_unsafe", "max_unknown"):
@@ -47,6 +50,8 @@ class FootprintConfig:
             in_range = is_number and 0 <= value <= 1
             require(in_range, f"footprint.{name}", "must lie in [0, 1]", repr(value), "leave it out for its default")
         require_positive(**{"footprint.max_extent": self.max_extent})
+        if self.height is not None:
+            require_positive(**{"footprint.height": self.height})
 
 
 class FootprintCheck(NamedTuple):
@@ -78,6 +83,7 @@ def check_footprint(
 
     Nor may the ground exceed the robot's limits, however well it is rated (`limits.limits_of`): no cell has a higher
     step, the plane through the known cells is not steeper, and no cell is higher above the outer ones than the belly.
+    On maps with levels, the robot fits below the ceiling of every cell.
 
     The paper's open code offers planners a similar check. It crops polygons at the window's border, ignores unknown
     cells and bounds the number of unsafe cells; here cells outside the window and unknown cells count as unknown, and
@@ -103,6 +109,8 @@ def check_footprint(
     ground = read_ground(emap, polygons, cfg.layer, cfg.max_extent, state, standing)
     values = ground.values
     is_unsafe = ground.known & (values < cfg.unsafe_traversability)
+    low = too_low(emap, cfg.height, state)
+    is_low = torch.zeros_like(is_unsafe) if low is None else read_patches(low, low, ground.cells, emap.cfg.grid)[1]
     masks = (ground.cells.inside, ground.known, is_unsafe, ground.assumed)
     total, known, unsafe, assumed = (mask.flatten(-2).sum(-1, dtype=torch.int32) for mask in masks)
     mean = values.flatten(-2).sum(-1) / known.clamp(min=1).to(values.dtype)
@@ -113,7 +121,7 @@ def check_footprint(
     has_good_mean = torch.where(known > 0, mean >= cfg.min_traversability, assumed > 0)
     ground_values = (ground.steps.flatten(-2).amax(-1), *fit_below(ground, emap.cfg.grid.resolution))
     step, slope, clearance = limits_of(emap.cfg).exceeded(*ground_values)
-    safe = has_few_bad_cells & has_good_mean & ~(step | slope | clearance)
+    safe = has_few_bad_cells & has_good_mean & ~(step | slope | clearance | is_low.flatten(-2).any(-1))
     return FootprintCheck(safe, mean, unknown_fraction, unsafe_fraction, *(v.to(mean.dtype) for v in ground_values))
 
 

@@ -57,12 +57,12 @@ def read_ground(
     assumed = torch.zeros_like(cells.inside)
     if standing is not None:
         below = mark_standing_cells(emap, standing, state) & ~known
-        assumed = _read_patches(values, below, cells, grid)[1]
-    values, known = _read_patches(values, known, cells, grid)
+        assumed = read_patches(values, below, cells, grid)[1]
+    values, known = read_patches(values, known, cells, grid)
     elevation = current.elevation.detach().to(torch.promote_types(current.elevation.dtype, torch.float32))
-    height, measured = _read_patches(elevation, current.validity, cells, grid)
+    height, measured = read_patches(elevation, current.validity, cells, grid)
     steps = compute_steps(elevation, current.validity, grid.resolution)
-    steps, _ = _read_patches(steps, torch.ones_like(current.validity), cells, grid)
+    steps, _ = read_patches(steps, torch.ones_like(current.validity), cells, grid)
     return GroundBelow(cells, values, known, assumed, steps, height, measured)
 
 
@@ -98,7 +98,7 @@ def _require_small(uv: Tensor, extent: Tensor, largest_extent: float, max_extent
     require(largest <= largest_extent, "polygons", rule, f"{largest:.6g} m", hint)
 
 
-def _read_patches(values: Tensor, known: Tensor, cells: PolygonCells, grid: GridConfig) -> tuple[Tensor, Tensor]:
+def read_patches(values: Tensor, known: Tensor, cells: PolygonCells, grid: GridConfig) -> tuple[Tensor, Tensor]:
     """Read the polygons' cells: their values, 0 where not known, and where they are known."""
     offset = torch.arange(cells.inside.shape[-1], device=values.device)
     i, j = cells.first[..., 0, None] + offset, cells.first[..., 1, None] + offset

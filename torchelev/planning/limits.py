@@ -30,7 +30,8 @@ ROUNDING = 1e-3  # [m], [rad] by which ground may exceed a limit
 class Limit(IntEnum):
     """What makes ground impassable whatever its rating; `NONE`: its rating does, or that it is unknown.
 
-    STEP, SLOPE and CLEARANCE are limits of the robot, CLASS is a forbidden class of `TraversalCostConfig.class_costs`.
+    STEP, SLOPE and CLEARANCE are limits of the robot, CLASS is a forbidden class of `TraversalCostConfig.class_costs`,
+    CEILING a surface too low above the ground for `TraversalCostConfig.height`.
     """
 
     NONE = 0
@@ -38,6 +39,7 @@ class Limit(IntEnum):
     SLOPE = 2
     CLEARANCE = 3
     CLASS = 4
+    CEILING = 5
 
 
 class Limits(NamedTuple):

@@ -60,6 +60,7 @@ _LIMITS = {
     Limit.SLOPE: "; there, the ground is steeper than the robot can climb",
     Limit.CLEARANCE: "; there, the ground would touch the robot's belly",
     Limit.CLASS: "; there, the ground is too likely of a class that class_costs forbids",
+    Limit.CEILING: "; there, what hangs above the ground is lower than the robot is high",
 }
 
 

@@ -15,6 +15,7 @@ from torchelev.errors import require, require_positive
 from torchelev.inputs.checks import FLOATS, check_tensor, given_or_default
 from torchelev.layers import Layer
 from torchelev.ops.windows import padded, window_maximum
+from torchelev.planning.ceilings import too_low
 from torchelev.planning.class_costs import Costs, parse_costs, rate_classes
 from torchelev.planning.inclination import compute_inclination
 from torchelev.planning.limits import find_exceeded
@@ -52,6 +53,8 @@ class TraversalCostConfig:
     class_costs: Costs = field(default_factory=dict, hash=False)
     max_forbidden: float = 0.3  #: probability of forbidden classes, together, above which ground is impassable
     unknown_class_cost: float = 1.0  #: factor on the cost of ground whose class is unknown
+    #: [m] of the robot: ground below a lower ceiling is impassable, on maps with levels; None: their `min_gap`
+    height: float | None = None
 
     def __post_init__(self) -> None:
         is_bool = isinstance(self.cross_unknown, bool)
@@ -61,6 +64,8 @@ class TraversalCostConfig:
         object.__setattr__(self, "class_costs", parse_costs(self.class_costs))
         for name in (each.name for each in fields(self) if each.name not in ("unknown_layer", "class_costs")):
             value = getattr(self, name)
+            if name == "height" and value is None:
+                continue
             in_range = isinstance(value, int | float) and 0 <= value < math.inf
             require(in_range, f"cost.{name}", "must be at least 0", repr(value), "leave it out for its default")
         in_range = self.min_traversability <= 1
@@ -90,6 +95,7 @@ def traversal_cost(
         nothing known:               impassable
         beyond the robot's limits:   impassable, whatever the rating (`planning.limits`)
         of a class with a cost:      times the factor, or impassable if forbidden (`class_costs.rate_classes`)
+        under a low ceiling:         impassable, on maps with levels, where the clearance is less than `height`
 
     Behind an edge, rays that passed over it bound the unseen ground from above. The nearer the robot is, the steeper it
     looks down, and ground that its rays still miss falls away more steeply than they do. So a steep bound indicates a
@@ -129,10 +135,14 @@ class Obstruction(NamedTuple):
 def find_obstruction(emap: ElevationMap, cfg: TraversalCostConfig, state: MapState | None = None) -> Obstruction:
     """Find the cells beyond the robot's limits and those of forbidden classes, and the factors of the others."""
     exceeded = find_exceeded(emap.state if state is None else state, emap.cfg)
-    if not cfg.class_costs:
-        return Obstruction(exceeded, None)
-    rating = rate_classes(emap, cfg.class_costs, cfg.max_forbidden, cfg.unknown_class_cost, state)
-    return Obstruction([*exceeded, rating.is_forbidden], rating.factor)
+    low, factor = too_low(emap, cfg.height, state), None
+    forbidden = torch.zeros_like(exceeded[0])
+    if cfg.class_costs:
+        rating = rate_classes(emap, cfg.class_costs, cfg.max_forbidden, cfg.unknown_class_cost, state)
+        forbidden, factor = rating.is_forbidden, rating.factor
+    if cfg.class_costs or low is not None:
+        exceeded.append(forbidden)
+    return Obstruction(exceeded if low is None else [*exceeded, low], factor)
 
 
 def cost_within(

@@ -148,7 +148,9 @@ def _settings(cfg: Any, prefix: str) -> Iterator[str]:
 def _kind(name: str, kinds: list[Any]) -> str:
     if name == "filters":
         return "CHAIN"
-    if name in ("completion", "channels", "levels") or any(isinstance(k, type) and issubclass(k, ByTensors) for k in kinds):
+    if name in ("completion", "channels", "levels") or any(
+        isinstance(k, type) and issubclass(k, ByTensors) for k in kinds
+    ):
         return "ONLY_PYTHON"
     if any(kind in _PLANNING for kind in kinds):
         return "IGNORED"

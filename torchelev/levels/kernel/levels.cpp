@@ -80,6 +80,8 @@ struct Map {
         return {u.lower + first, u.upper + first, u.level_variance + first, u.support + first, u.time + first, u.L, cells};
     }
     float& free_top(int64_t p) const { return u.free_top[b * cells + p]; }
+    uint8_t& is_open(int64_t p) const { return u.is_open[b * cells + p]; }
+    void forget_space(int64_t p) const { free_top(p) = -INFINITE, is_open(p) = 0; }
 
     // Move to the window of the map, and age: `move`, `age`.
     void follow() {
@@ -107,7 +109,7 @@ struct Map {
 
     void blank(int64_t p) const {
         for (int64_t l = 0; l < u.L; l++) cell_at(p).remove(l);
-        free_top(p) = -INFINITE;
+        forget_space(p);
     }
 
     // The scan ---------------------------------------------------------------------------------------------------
@@ -324,7 +326,7 @@ struct Map {
         const bool ground_floats = known && floats(c, g);
         if (ground_floats && shows_ground(clusters, g)) {
             statistics[levels::DROPPED] += cell.insert(ground_of(c), u.ground_time[b * cells + c]);
-            statistics[levels::OPENED]++, known = false, forget_ground(c);
+            statistics[levels::OPENED]++, known = false, forget_ground(c), is_open(p) = 0;
         }
         for (size_t rank = 0; rank < clusters.size() && rank < size_t(2 * (u.L + 1)); rank++) {
             const Found found = clusters[rank].found(u.variance_floor);
@@ -344,8 +346,9 @@ struct Map {
                 if (stands) found_ground(c, nearest), known = true, g = u.elevation[b * cells + c];
             } else {
                 const bool above = known && found.lower > g;
-                bool shown = known && !above ? ground_floats
-                                             : (above && free_top(p) >= g + u.min_gap) || hangs(c, found.lower);
+                bool shown = !known ? hangs(c, found.lower)
+                             : above ? is_open(p) || floats(c, found.lower)
+                                     : ground_floats;
                 shown |= clusters[rank].above || (u.by_gap && (known || rank > 0));
                 if (!shown) continue;
                 statistics[levels::DROPPED] += cell.insert(found, 0), statistics[levels::OPENED]++;
@@ -362,7 +365,9 @@ struct Map {
             for (int64_t i = begin; i < end; i++)
                 for (int64_t j = 0; j < u.W; j++) {
                     const int64_t c = i * u.W + j, p = row[i] + column[j];
-                    free_top(p) = std::max(free_top(p), own.highest[c]);
+                    const float g = u.elevation[b * cells + c], high = own.highest[c];
+                    free_top(p) = std::max(free_top(p), high);
+                    is_open(p) |= u.validity[b * cells + c] & (own.lowest[c] < g + 0.5f * u.min_gap) & (high >= g + u.min_gap);
                     if (has_levels(p)) tidy_cell(c, p, of_part);
                 }
             merged += of_part[levels::MERGED], cleared += of_part[levels::CLEARED];
@@ -449,7 +454,7 @@ struct Map {
         for_strange(standing, [&](int64_t c, int64_t i, int64_t j) {
             if (own.changed[c] || own.search.is_reached(own.search.at(i, j))) return false;
             cell_at(row[i] + column[j]).insert(ground_of(c), u.ground_time[b * cells + c]);
-            forget_ground(c);
+            forget_ground(c), forget_space(row[i] + column[j]);
             return false;
         });
     }
@@ -466,7 +471,7 @@ struct Map {
             cell.lower[q] = cell.upper[q] = old.mean, cell.variance[q] = old.variance;
             cell.support[q] = support, cell.time[q] = time;
         }
-        free_top(p) = -INFINITE;
+        forget_space(p);
     }
 
     void put_aside() const {

@@ -28,6 +28,7 @@ struct Update {
     // The levels, in rings: cell k of an axis lies at k modulo the window's size.
     int64_t* before;  // (B, 2) corners of the levels
     float *lower, *upper, *level_variance, *support, *time, *free_top;
+    uint8_t* is_open;
     uint8_t* aside;       // (B, S, N)
     int64_t* statistics;  // (B, 5)
     int64_t B, S, N, H, W, L;

@@ -134,7 +134,7 @@ def gate_points(
     cfg: SensorConfig,
     resolution: float,
 ) -> Gates:
-    """Leave out points on the robot's body, above the ramp and on other surfaces; set sigma_p^2 = alpha_d d^2 + noise_floor."""
+    """Leave out points on the body, above the ramp or on other surfaces; sigma_p^2 = alpha_d d^2 + noise_floor."""
     relative, position = mapped.relative.transpose(1, 2), mapped.position.transpose(1, 2)
     if variance is None:
         noise = cfg.noise_factor * sensed.distance2 + cfg.noise_floor
@@ -181,8 +181,9 @@ def measure(
     """Turn sensor-frame points into a measurement (paper, Sec. II-A "transform" and II-C).
 
     Noise: sigma_p^2 = alpha_d * d^2 + noise_floor with d the distance from the sensor, or the caller's variances.
-    Gates: not finite, distance, the robot's body, exclusion ramp, other surfaces (`aside`). Rejected points have used = False. A point counts as
-    not finite if its variance has no finite inverse, or if a pose of its environment is not finite or beyond FARTHEST.
+    Gates: not finite, distance, the robot's body, exclusion ramp, other surfaces (`aside`). Rejected points have used =
+    False. A point counts as not finite if its variance has no finite inverse, or if a pose of its environment is not
+    finite or beyond FARTHEST.
     """
     sound, T_map_sensor, T_map_base, T_base_links = sound_poses(T_map_sensor, T_map_base, T_base_links)
     position = T_map_sensor[..., :3, 3]
