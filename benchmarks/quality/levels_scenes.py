@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -64,10 +65,11 @@ class Truth(NamedTuple):
     cell: tuple[int, int]  #: where it stands
     ground: Tensor  #: (H, W) [m], NaN where no way leads to any of several surfaces
     tops: Tensor  #: (K, H, W) [m] all surfaces, inf for none
-    ceiling: Tensor  #: (H, W) [m], inf for none
-    counts: Tensor  #: (H, W) the ground was hit from above, and is even, so that its height is no matter of the cell's border
-    ceiling_hit: Tensor  #: (H, W) the same of the ceiling, from below
-    ceiling_even: Tensor  #: (H, W) even, or none anywhere around
+    ceiling: Tensor  #: (H, W) [m] over the middle of the cell, inf for none
+    lowest: Tensor  #: (H, W) [m] ceiling over any of the cell, inf for none
+    counts: Tensor  #: (H, W) the ground was hit from above, and is that of the cells around to 2 cm
+    ceiling_hit: Tensor  #: (H, W) the lowest ceiling was hit from below
+    ceiling_even: Tensor  #: (H, W) the ceiling is that of the places up to a cell around to 2 cm
     free: Tensor  #: (N, 3) numbers of voxels that rays passed, at least a voxel from anything
     occupied: Tensor  #: (N, 3) numbers of voxels that rays hit
 
@@ -149,8 +151,9 @@ def record(walk: Walk, stride: int, scored: int) -> Iterator[Scan]:
         points = LIDAR.cast(scene, T_sensor)
         is_scored = k > 0 and k % scored == 0
         space.add(to_map(points, T_sensor), T_sensor[:3, 3], is_scored)
-        at = float(foot[k]), xy[k]
-        yield Scan(k, points, T_sensor, T_base, (lambda c, at=at: space.truth(c, *at)) if is_scored else None)
+        yield Scan(
+            k, points, T_sensor, T_base, partial(space.truth, foot=float(foot[k]), xy=xy[k]) if is_scored else None
+        )
 
 
 def to_map(points: Tensor, T_sensor: Tensor) -> Tensor:
@@ -214,9 +217,9 @@ class _Space:
         tops = torch.where(is_surface, top, torch.inf).sort(0).values
         ground = choose(tops[:4], foot, (i, j))[1]
         ceiling = self.scene.ceiling(centers, ground)
-        ceiling_even = _is_even(ceiling.clamp(max=99.0))
+        lowest, even = self._ceilings_around(centers, ground)
         counts = ground.isfinite() & _is_even(ground) & self._was_hit(0, centers, ground)
-        hit = ceiling.isfinite() & ceiling_even & self._was_hit(1, centers, ceiling)
+        hit = lowest.isfinite() & self._was_hit(1, centers, lowest)
         window = tuple(slice(int(c + o), int(c + o) + n) for c, o, n in zip(corner, ORIGIN, ground.shape, strict=False))
         free, occupied = (
             self.passed[window] & self.is_clear[window],
@@ -224,7 +227,21 @@ class _Space:
         )
         first = torch.tensor([*corner.tolist(), -int(ORIGIN[2])])
         some = (self._some(mask) + first for mask in (free, occupied))
-        return Truth(F.pad(corner, (0, 1)), foot, (i, j), ground, tops, ceiling, counts, hit, ceiling_even, *some)
+        place = F.pad(corner, (0, 1)), foot, (i, j)
+        return Truth(*place, ground, tops, ceiling, lowest, counts, hit, even, *some)
+
+    def _ceilings_around(self, centers: Tensor, ground: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the lowest ceiling over each cell, and whether all up to a cell around agree; thin boxes count."""
+        halves = range(-2, 3)
+        found = {
+            (i, j): self.scene.ceiling(centers + 0.499 * VOXEL * torch.tensor([i, j]), ground).clamp(max=99.0)
+            for i in halves
+            for j in halves
+        }
+        lowest = torch.stack([z for (i, j), z in found.items() if max(abs(i), abs(j)) < 2]).amin(0)
+        around = torch.stack([*found.values()])
+        even = around.amax(0) - around.amin(0) < 0.02
+        return torch.where(lowest < 99.0, lowest, torch.inf), even
 
     def _was_hit(self, side: int, centers: Tensor, height: Tensor) -> Tensor:
         """Return where rays that go down (0) or up (1) ended within a voxel of a height (H, W) [m]."""

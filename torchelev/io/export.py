@@ -85,10 +85,10 @@ def take(emap: ElevationMap, env: int = 0, layers: Sequence[str] | None = None) 
     """
     require(0 <= env < emap.num_envs, "env", f"must lie in [0, {emap.num_envs})", env, "environments count from 0")
     names = emap.layers if layers is None else layers
-    if emap.channels is None:
+    if emap.channels is None and emap.levels is None:
         state = map_layers(lambda value: value[env : env + 1], emap.state)  # or filters would run for all environments
         arrays = {name: as_array(emap.layer(name, state=state)[0]) for name in names}
-    else:  # channels are no part of a state
+    else:  # channels and levels are no part of a state
         arrays = {name: as_array(emap.layer(name)[env]) for name in names}
     center = as_array(emap.center[env])
     return SavedMap(arrays, emap.cfg.grid.resolution, center, emap.cfg.to_dict())

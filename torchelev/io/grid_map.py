@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchelev.errors import require
+from torchelev.levels.views import LAYERS as LEVEL_LAYERS
 
 if TYPE_CHECKING:
     from torchelev.elevation_map import ElevationMap
@@ -140,9 +141,9 @@ def to_grid_map(
 
 
 def _flat(name: str, values: NDArray, emap: ElevationMap) -> NDArray:
-    """Return a layer (H, W): a colour (3, H, W) packed, all else as it is."""
+    """Return a layer (H, W): a colour (3, H, W) packed, ceilings that are not there as NaN, all else as it is."""
     if values.ndim == 2:
-        return values
+        return np.where(np.isinf(values), np.nan, values) if name in LEVEL_LAYERS else values
     cfg = emap.cfg.channels[name]
     hint = f"give {', '.join(cfg.components(name))}"
     require(cfg.is_color, "layers", "must have one value for each cell", f"{name!r} with {cfg.size}", hint)

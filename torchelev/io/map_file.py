@@ -35,7 +35,8 @@ def save_map(path: str | Path, emap: ElevationMap) -> None:
     """Write a whole map, with all environments, its config and its precision, as an `.npz` without pickled objects.
 
     The arrays are `header` (JSON: format, version, dtype, config), each field of `MapState` by its name, each field of
-    `Statistics` as `last_<name>`, what channels hold as `channels_<name>`, and the weights of a learned head as
+    `Statistics` as `last_<name>`, what channels and levels hold as `channels_<name>` and
+    `levels_<name>`, and the weights of a learned head as
     `head_<name>`, of a completion network as `completion_net_<name>`. As in the map's state, unknown cells have
     validity 0, not NaN.
 
@@ -55,7 +56,7 @@ def map_arrays(emap: ElevationMap, envs: slice = slice(None)) -> dict[str, Any]:
     dtype = str(emap.elevation.dtype).removeprefix("torch.")
     header = {"format": FORMAT, "version": VERSION, "dtype": dtype, "config": emap.cfg.to_dict()}
     header |= {name: None if net is None else net.config for name, net in _nets(emap).items()}
-    of_environments = {name: value[envs] for name, value in (name_tensors(emap.state) | _channels(emap)).items()}
+    of_environments = {name: value[envs] for name, value in (name_tensors(emap.state) | _followers(emap)).items()}
     arrays = {name: as_array(value) for name, value in (of_environments | _weights(emap)).items()}
     return {"header": np.array(json.dumps(header)), **arrays}
 
@@ -98,7 +99,7 @@ def load_map(
         state = rate(state, emap.cfg, None if emap.head is None else emap.head.weights)
     emap.load_state(state)
     B = len(arrays["corner"])
-    for name, value in _channels(emap).items():
+    for name, value in _followers(emap).items():
         value.copy_(torch.from_numpy(_array(path, arrays, name, value, (B, *value.shape[1:])))[ids])
     return emap
 
@@ -114,10 +115,11 @@ def _weights(emap: ElevationMap) -> dict[str, Tensor]:
     return {f"{name}_{key}": value for name, net in nets.items() for key, value in net.state_dict().items()}
 
 
-def _channels(emap: ElevationMap) -> dict[str, Tensor]:
-    """Return the buffers of the map's channels by the names of their arrays."""
-    buffers = () if emap.channels is None else emap.channels.named_buffers()
-    return {f"channels_{name}": value for name, value in buffers}
+def _followers(emap: ElevationMap) -> dict[str, Tensor]:
+    """Return the buffers of the map's channels and levels by the names of their arrays."""
+    parts = {name: part for name in ("channels", "levels") if (part := getattr(emap, name)) is not None}
+    buffers = ((f"{name}_{key}", value) for name, part in parts.items() for key, value in part.named_buffers())
+    return {name: value for name, value in buffers if not name.startswith("levels_last_")}
 
 
 def as_array(value: Tensor) -> NDArray:

@@ -158,8 +158,13 @@ class ReadableMap(MapBuffers):
         """Return a layer of one surface of each cell, and where there is one; arguments and errors as of `layer`."""
         hint = "give the config levels=LevelsConfig(max_levels=3)"
         require(self.levels is not None, "level", "needs a map with levels", repr(level), hint)
+        return views.by_level(name, level, self._surfaces(state))
+
+    def _surfaces(self, state: MapState | None) -> views.View:
+        """Return all surfaces of the maps, with the ground of a state."""
         assert self.levels is not None
-        return views.by_level(name, level, self.levels.view(self.state if state is None else state))
+        self._require_all(state)
+        return self.levels.view(self.state if state is None else state)
 
     def read_channel(
         self, name: str, state: MapState | None = None, cell: Int[Tensor, "B M"] | None = None
@@ -173,14 +178,20 @@ class ReadableMap(MapBuffers):
         """
         require(name in self.cfg.channels, "layer", "must be a channel", repr(name), "see cfg.channels", KeyError)
         assert self.channels is not None
-        if state is not None:
-            rule, actual = f"must be of all {self.num_envs} maps, as channels are no part of it", len(state.validity)
-            require(
-                actual == self.num_envs, "state", rule, actual, "leave it out, and choose the environment afterwards"
-            )
+        self._require_all(state)
         values, known = self.channels.read(name, state, cell)
         validity = (self.state if state is None else state).validity
         return values, known & (validity if cell is None else validity.flatten(1).gather(1, cell))
+
+    def _require_all(self, state: MapState | None) -> None:
+        """Refuse the state of some of the maps, where what is read is no part of it."""
+        if state is not None:
+            rule, actual = (
+                f"must be of all {self.num_envs} maps, as channels and levels are no part of it",
+                len(state.validity),
+            )
+            hint = "leave it out, and choose the environment afterwards"
+            require(actual == self.num_envs, "state", rule, actual, hint)
 
     def load_state(self, state: MapState) -> None:
         """Copy a state into the buffers, such as one that `forward` returned; channels keep what fits its ground.
@@ -222,9 +233,8 @@ class ReadableMap(MapBuffers):
         if name in COMPLETED:
             return self._complete(state)[name]
         if name in views.LAYERS:
-            assert self.levels is not None and self.cfg.levels is not None
-            surfaces = self.levels.view(self.state if state is None else state)
-            return getattr(views, name)(surfaces, self.cfg.levels.min_gap)  # type: ignore[no-any-return]
+            assert self.cfg.levels is not None
+            return getattr(views, name)(self._surfaces(state), self.cfg.levels.min_gap)  # type: ignore[no-any-return]
         if name not in LAYERS:
             channel = name.split(".")[0]
             values, known = self.read_channel(channel, state)

@@ -13,6 +13,7 @@ from torchelev.app.interrupts import defer_interrupts
 from torchelev.app.mapping.map_channels import add_channels
 from torchelev.channels.config import ChannelConfig
 from torchelev.io import Frame, MappingRun
+from torchelev.levels.config import LevelsConfig
 
 if TYPE_CHECKING:
     from torchelev.config import ElevationMapConfig
@@ -28,6 +29,7 @@ class MapOptions:
     fixed: bool  #: keep the window in place
     has_base: bool = False  #: each scan comes with the pose of the base
     channels: Mapping[str, ChannelConfig] = field(default_factory=dict)  #: for what the recording brings beside heights
+    levels: int | None = None  #: surfaces in each cell; None: the config's
 
     @property
     def knows_base(self) -> bool:
@@ -46,6 +48,8 @@ def new_map(config: ElevationMapConfig, device: str, options: MapOptions) -> Ele
     if config.sensor.body is not None and options.T_base_sensor is None and not options.has_base:
         raise ValueError("config.sensor.body: the body box turns with the robot's base; give --extrinsics")
     config = add_channels(config, options.channels)
+    if options.levels is not None:
+        config = replace(config, levels=replace(config.levels or LevelsConfig(), max_levels=options.levels))
     if not options.knows_base:
         config = replace(config, overlap=None)
     try:

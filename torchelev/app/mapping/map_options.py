@@ -162,6 +162,13 @@ _OPTIONS: list[Callable[[Any], Any]] = [
         is_flag=True,
         help="Keep the map in place, centred on the sensor's path, instead of following the sensor.",
     ),
+    _map(
+        "--levels",
+        type=int,
+        metavar="K",
+        help="Surfaces in each cell, such as 3 for ground, table and ceiling: the ground is the one that the robot "
+        "reaches.  [default: from --config, or the ground alone]",
+    ),
     _map("--device", default="cpu", show_default=True, help="Torch device: cpu, cuda, cuda:1, ..."),
     _map("--config", type=_PATH, metavar="FILE", help="YAML settings of ElevationMapConfig, grouped by stage."),
     _output(

@@ -18,6 +18,7 @@ class MapRequest:
     resolution: float | None = None  #: [m] cell size; None: the config's
     size: float | None = None  #: [m] side length of the map; None: the config's
     fixed: bool = False  #: keep the window in place
+    levels: int | None = None  #: surfaces in each cell; None: the config's
     device: str = "cpu"  #: torch device
     config: Path | None = None  #: YAML settings
     dt: float | None = None  #: [s] between scans; None: from the pose file

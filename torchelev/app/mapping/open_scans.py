@@ -64,6 +64,7 @@ def _open_folder(request: MapRequest) -> tuple[Recording, MapOptions]:
         T_base_sensor=mount,
         sensor_height=request.sensor_height,
         fixed=request.fixed,
+        levels=request.levels,
         channels=wanted_channels(request.colour),
     )
 
@@ -125,6 +126,7 @@ def _open_bag(request: MapRequest) -> Iterator[tuple[Scans, MapOptions]]:
             T_base_sensor=None,
             sensor_height=None,
             fixed=request.fixed,
+            levels=request.levels,
             has_base=scans.has_base,
             channels=wanted_channels(request.colour, num_classes, _class_names(request)),
         )

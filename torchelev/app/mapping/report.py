@@ -33,6 +33,7 @@ def summarize(run: MappingRun, num_scans: int) -> list[str]:
         f"window    {size}, centred on ({x:.2f}, {y:.2f})",
         f"coverage  {coverage:.1f} % of the window's cells",
         *_describe_channels(run.emap),
+        *_describe_levels(run.emap),
         f"points    {used:,} used ({used_percent:.1f} %); rejected: {reasons or 'none'}",
         f"time      {np.median(run.update_ms):.1f} ms per scan (median; slowest {max(run.update_ms):.1f} ms)",
     ]
@@ -44,6 +45,17 @@ def _describe_channels(emap: ElevationMap) -> Iterator[str]:
     for name in emap.cfg.channels if known.any() else ():
         share = float(emap.read_channel(name)[1][0][known].float().mean())
         yield f"channel   {name}: {100 * share:.1f} % of the known cells"
+
+
+def _describe_levels(emap: ElevationMap) -> Iterator[str]:
+    """Yield how much of the known ground lies below something, and the lowest clearance."""
+    if emap.levels is None:
+        return
+    clearance, known = emap.layer("clearance")[0], emap.layer("validity")[0] > 0
+    covered = clearance[clearance.isfinite()]
+    share = 100 * len(covered) / max(1, int(known.sum()))
+    lowest = f"; the lowest clearance is {float(covered.min()):.2f} m" if len(covered) else ""
+    yield f"levels    {share:.1f} % of the known cells lie below a ceiling{lowest}"
 
 
 def describe_emptiness(run: MappingRun) -> str | None:
@@ -77,7 +89,7 @@ def suggest_options(run: MappingRun, fixed: bool, knows_base: bool) -> list[str]
 
 
 def choose_panels(saved: SavedMap, filters: Sequence[str] = ()) -> list[Panel]:
-    """Return panels of the four main layers, of colours and classes, and of filters; heights share one colour scale."""
+    """Return panels of the main layers, colours and classes, and filters; heights share one colour scale."""
     from torchelev.viz.plot import Panel
     from torchelev.viz.style import DEVIATIONS, RATINGS
 
@@ -90,9 +102,19 @@ def choose_panels(saved: SavedMap, filters: Sequence[str] = ()) -> list[Panel]:
         Panel(title="standard deviation", values=np.sqrt(layers["variance"]), unit="m", cmap=DEVIATIONS, vmin=0.0),
         Panel(title="traversability", values=traversability, unit="0 to 1", cmap=RATINGS, vmin=0.0, vmax=1.0),
         Panel(title="upper bound", values=layers["upper_bound"], unit="m", vmin=low, vmax=high),
+        *_clearance_panel(saved),
         *_channel_panels(saved),
         *(Panel(title=name, values=layers[name]) for name in filters),
     ]
+
+
+def _clearance_panel(saved: SavedMap) -> Iterator[Panel]:
+    """Yield a panel of the clearance, of a map with levels."""
+    from torchelev.viz.plot import Panel
+
+    if "clearance" in saved.layers:
+        values = np.where(np.isinf(saved.layers["clearance"]), np.nan, saved.layers["clearance"])
+        yield Panel(title="clearance below ceilings", values=values, unit="m")
 
 
 def _channel_panels(saved: SavedMap) -> Iterator[Panel]:

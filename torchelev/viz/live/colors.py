@@ -14,7 +14,7 @@ from torchelev.viz.channels import channel_colors, class_legend
 from torchelev.viz.style import DEVIATIONS, HEIGHTS, RATINGS
 
 DEVIATION = "standard deviation"  #: shown in place of the variance
-_UNITS = {"elevation": "m", "upper_bound": "m", DEVIATION: "m", "time": "s"}
+_UNITS = {"elevation": "m", "upper_bound": "m", DEVIATION: "m", "time": "s", "ceiling": "m", "clearance": "m"}
 _COLOR_MAPS = {DEVIATION: DEVIATIONS, "traversability": RATINGS, "time": "cividis_r"}
 _FIXED_LIMITS = {"traversability": (0.0, 1.0), "validity": (0.0, 1.0), "normal_z": (0.0, 1.0)}
 _SETTLED = 0.1  # share of their span by which limits may be off before they move, so that colours do not flicker

@@ -10,10 +10,11 @@ import torch
 from numpy.typing import NDArray
 
 from torchelev.planes import segment
-from torchelev.viz.live.snapshot import BOUND, CLOUD, FRAMES, PATH, PLAN, PLANES, SCAN, Snapshot
-from torchelev.viz.live.surface import bound_sheet, surface
+from torchelev.viz.live.snapshot import BOUND, CEILING, CLOUD, FRAMES, PATH, PLAN, PLANES, SCAN, Snapshot
+from torchelev.viz.live.surface import bound_sheet, ceiling_sheet, surface
 
-_COLORS = {BOUND: (120, 150, 190), CLOUD: (230, 60, 60), SCAN: (240, 228, 66), PATH: (213, 94, 0), PLAN: (230, 159, 0)}
+_COLORS = {BOUND: (120, 150, 190), CEILING: (150, 120, 170), CLOUD: (230, 60, 60), SCAN: (240, 228, 66)}
+_COLORS |= {PATH: (213, 94, 0), PLAN: (230, 159, 0)}
 _OUTLINE, _HOLE = (0, 114, 178), (204, 121, 167)
 _LIFT = 0.01  # [m] height of lines above the surface, which would hide them
 _MAX_PATH = 5_000
@@ -48,6 +49,8 @@ class Scene:
         self._draw_surface(snapshot, colors)
         if BOUND in parts:
             self._draw_bound(snapshot)
+        if CEILING in parts:
+            self._draw_ceiling(snapshot)
         if FRAMES in parts:
             self._draw_frames(snapshot)
         for name, points, size in ((CLOUD, snapshot.cloud, 0.015), (SCAN, snapshot.scan, 0.03)):
@@ -80,6 +83,12 @@ class Scene:
         if len(triangles):
             ghost = {"color": _COLORS[BOUND], "opacity": 0.3, "side": "double", "cast_shadow": False}
             self._keep(BOUND, self._scene.add_mesh_simple, vertices, triangles, **ghost)
+
+    def _draw_ceiling(self, snapshot: Snapshot) -> None:
+        vertices, triangles = ceiling_sheet(snapshot.map, self.origin)
+        if len(triangles):
+            ghost = {"color": _COLORS[CEILING], "opacity": 0.25, "side": "double", "cast_shadow": False}
+            self._keep(CEILING, self._scene.add_mesh_simple, vertices, triangles, **ghost)
 
     def _draw_frames(self, snapshot: Snapshot) -> None:
         if snapshot.T_map_base is not None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torchelev.errors import require
 from torchelev.io.export import SavedMap, take
 from torchelev.layers import LAYERS
+from torchelev.levels.views import LAYERS as LEVEL_LAYERS
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -21,11 +22,11 @@ _MAX_POINTS = 20_000  # of a cloud, so that a page stays fluid
 _NO_POINTS = np.zeros((0, 3))
 
 
-BOUND, CLOUD, SCAN, FRAMES, PATH, PLANES, PLAN = (
-    "upper bound", "last cloud", "policy's scan", "frames", "path", "planes", "planned path"
+BOUND, CEILING, CLOUD, SCAN, FRAMES, PATH, PLANES, PLAN = (
+    "upper bound", "ceiling", "last cloud", "policy's scan", "frames", "path", "planes", "planned path"
 )  # fmt: skip
 #: What can be shown beside the surface, and whether it is at first.
-PARTS = {BOUND: True, CLOUD: False, SCAN: True, FRAMES: True, PATH: True, PLANES: False, PLAN: True}
+PARTS = {BOUND: True, CEILING: True, CLOUD: False, SCAN: True, FRAMES: True, PATH: True, PLANES: False, PLAN: True}
 
 
 class Snapshot(NamedTuple):
@@ -44,7 +45,8 @@ class Snapshot(NamedTuple):
         """Names of `PARTS` that can be shown beside the surface."""
         robot = {FRAMES, PATH} if self.T_map_base is not None else {FRAMES} if self.T_map_sensor is not None else set()
         points = {CLOUD: self.cloud, SCAN: self.scan, PLAN: self.plan}
-        return {BOUND, PLANES} | robot | {name for name, values in points.items() if len(values)}
+        ceilings = {CEILING} if "ceiling" in self.map.layers else set()
+        return {BOUND, PLANES} | ceilings | robot | {name for name, values in points.items() if len(values)}
 
     @property
     def nbytes(self) -> int:
@@ -88,7 +90,8 @@ def take_snapshot(
     is_flat = scan is not None and tuple(np.shape(scan))[-1:] == (2,)
     policy = _pick("scan", scan, env, B, (2,) if is_flat else (3,), (2, 3))
     planned = _pick("plan", plan, env, B, (3,), (2,))
-    saved = take(emap, env, (*LAYERS, *(name for name in layers if name not in LAYERS)))
+    own = (*LAYERS, *(() if emap.levels is None else LEVEL_LAYERS))
+    saved = take(emap, env, (*own, *(name for name in layers if name not in own)))
     policy = _onto(saved, policy) if policy is not None and is_flat else policy
     return Snapshot(
         saved,

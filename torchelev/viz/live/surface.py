@@ -44,6 +44,13 @@ def bound_sheet(saved: SavedMap, origin: NDArray[np.float64]) -> tuple[NDArray[n
     return (vertices - origin).astype(np.float32), triangles.astype(np.uint32)
 
 
+def ceiling_sheet(saved: SavedMap, origin: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+    """Return vertices and triangles of the ceilings of a map with levels; none of another one."""
+    heights = saved.layers.get("ceiling", np.full_like(saved.layers["elevation"], np.nan))
+    vertices, triangles = triangulate(np.where(np.isinf(heights), np.nan, heights), saved.center, saved.resolution)
+    return (vertices - origin).astype(np.float32), triangles.astype(np.uint32)
+
+
 def find_cell(saved: SavedMap, start: NDArray[np.float64], direction: NDArray[np.float64]) -> tuple[int, int] | None:
     """Return the first cell (i, j) whose elevation a ray meets from above, or None.
 
