@@ -61,7 +61,7 @@ BLIND = LevelsConfig().blind_cells(GRID)
 CLOSE = 0.3  # [m] by which a ceiling may be wrong
 LIBRARIES = ("octomap", "vdbfusion")
 MOST = 6  # surfaces of a cell
-FREE, OCCUPIED, UNKNOWN = 0, 1, -1
+FREE, OCCUPIED, UNKNOWN, BELOW = 0, 1, -1, 2
 UP = torch.tensor([0, 0, 1])
 
 
@@ -70,7 +70,7 @@ class Reading(NamedTuple):
 
     ground: Tensor  #: (H, W) [m], NaN where unknown
     ceiling: Tensor  #: (H, W) [m], inf for none, NaN where unknown
-    label: Callable[[Tensor], Tensor]  #: FREE, OCCUPIED or UNKNOWN of voxels (N, 3)
+    label: Callable[[Tensor], Tensor]  #: FREE, OCCUPIED, UNKNOWN, or BELOW the ground, of voxels (N, 3)
 
 
 class Map(Protocol):
@@ -130,7 +130,8 @@ def label_by_surfaces(voxels: Tensor, lower: Tensor, upper: Tensor, ground: Tens
     is_occupied = ((lower[:, i, j] < bottom + VOXEL) & (upper[:, i, j] >= bottom)).any(0)
     middle = bottom + 0.5 * VOXEL
     is_free = (middle > ground[i, j]) & (middle < ceiling[i, j])
-    return torch.where(is_occupied, OCCUPIED, torch.where(is_free, FREE, UNKNOWN)).where(inside, UNKNOWN)
+    others = torch.where(is_free, FREE, torch.where(middle < ground[i, j], BELOW, UNKNOWN))
+    return torch.where(inside, torch.where(is_occupied, OCCUPIED, others), UNKNOWN)
 
 
 class OctoMap:
@@ -235,8 +236,14 @@ class VdbFusion:
         is_ground = is_top & (above - heights >= FREE_HEIGHT)
         tops, order = torch.where(is_ground, heights, torch.inf).sort(0)
         ground, ceiling = _ground_of(tops, above.gather(0, order), truth)
-        crossed = torch.where(heights < torch.inf, heights, torch.nan)
-        return Reading(ground, ceiling, lambda v: label_by_surfaces(v - truth.first, crossed, crossed, ground, ceiling))
+        occupied, none = torch.zeros(SHAPE, dtype=torch.bool), torch.full_like(heights, torch.nan)
+        occupied[places(voxels_of(torch.from_numpy(vertices)))] = True
+
+        def label(voxels: Tensor) -> Tensor:
+            by_surfaces = label_by_surfaces(voxels - truth.first, none, none, ground, ceiling)
+            return torch.where(occupied[places(voxels)], OCCUPIED, by_surfaces)
+
+        return Reading(ground, ceiling, label)
 
     def num_bytes(self) -> int:
         """Return by how much its process grew until the last reading, and end the process."""
@@ -284,7 +291,7 @@ def tally(reading: Reading, truth: Truth, with_voxels: bool) -> Counter[str]:
     told, hit = right & ~reading.ceiling.isnan() & truth.ceiling_even, right & truth.ceiling_hit
     close = told & (above.abs() <= CLOSE)  # not where both are infinite
     sums.update(ceilings=int(hit.sum()), told=int(told.sum()), close=int(close.sum()))
-    sums["missed"] += int((hit & ~(reading.ceiling <= truth.ceiling + CLOSE)).sum())
+    sums["missed"] += int((hit & ~(reading.ceiling <= truth.lowest + CLOSE)).sum())
     sums["false"] += int((told & (reading.ceiling < truth.ceiling - CLOSE)).sum())
     sums["ceiling"] += float(above[close].square().sum())  # type: ignore[assignment]
     if with_voxels:
@@ -293,8 +300,8 @@ def tally(reading: Reading, truth: Truth, with_voxels: bool) -> Counter[str]:
         around = torch.cat([torch.eye(3, dtype=torch.int64), -torch.eye(3, dtype=torch.int64)])
         beside = reading.label((truth.occupied[lost][:, None] + around).flatten(0, 1)).view(-1, 6)
         sums.update(free=len(free), free_as_occupied=int((free == OCCUPIED).sum()))
-        sums.update(free_unknown=int((free == UNKNOWN).sum()), occupied=len(lost))
-        sums["occupied_as_free"] += int((beside != OCCUPIED).all(-1).sum())
+        sums.update(free_unknown=int(((free == UNKNOWN) | (free == BELOW)).sum()), occupied=len(lost))
+        sums["occupied_as_free"] += int(((beside == FREE) | (beside == UNKNOWN)).all(-1).sum())
     return sums
 
 
@@ -351,7 +358,8 @@ def _others(libraries: Iterable[str], python: str) -> dict[str, Map]:
 
 def measure(libraries: Iterable[str], python: str) -> dict[str, Any]:
     """Return what each map scores on each walk."""
-    walks, beside, totals = {}, {}, {}
+    walks, beside = {}, {}
+    totals: dict[str, Counter[str]] = {}
     for walk in WALKS:
         maps: dict[str, Map] = {f"{kind}, {noise}": Elevation(KINDS[kind]) for noise in NOISES for kind in KINDS}
         noises = {name: NOISES[name.split(", ")[1]] for name in maps}

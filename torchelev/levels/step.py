@@ -52,7 +52,6 @@ class _Scan(NamedTuple):
 
     clusters: Clusters
     floating: Bool[Tensor, "B M"]  # clusters below which rays passed
-    from_below: Bool[Tensor, "B M"]  # clusters above all sensors
     ground_floats: Bool[Tensor, "B cells"]
     sights: list[Sight]
     rays: RayHeights
@@ -125,9 +124,8 @@ def _look_at(state: MapState, m: Measurement, slot: Tensor, inside: Tensor, cfg:
     place = clusters.slot.clamp(max=cfg.grid.num_cells - 1)
     rays, lower = ray_heights(sights, x, y, size), clusters.lower.clamp(max=1e6)
     floating = floats(sights, x.gather(1, place), y.gather(1, place), lower, rays.lowest.gather(1, place), gap, size)
-    from_below = lower > m.origin[..., 2].amax(1)[:, None] + 0.5 * gap
     ground_floats = floats(sights, x, y, state.elevation.flatten(1), rays.lowest, gap, size)
-    return _Scan(clusters, floating, from_below, ground_floats & state.validity.flatten(1), sights, rays, x, y)
+    return _Scan(clusters, floating, ground_floats & state.validity.flatten(1), sights, rays, x, y)
 
 
 def _sort_points(
@@ -148,9 +146,9 @@ def _sort_points(
     for rank in range(2 * own.max_levels):
         there = in_cells(clusters.number, clusters, rank, num_cells, 0.0)
         found = _found_of(clusters, rank, cfg)
-        ramp, flies, hangs = (
+        ramp, flies = (
             in_cells(mask.to(there.dtype), clusters, rank, num_cells, 0.0) > 0
-            for mask in (clusters.above_ramp, scan.floating, scan.floating | scan.from_below)
+            for mask in (clusters.above_ramp, scan.floating)
         )
         g, known = state.elevation, state.validity
         dg = torch.where(known, distance(found.lower, found.upper, g, g), torch.inf)
@@ -159,12 +157,12 @@ def _sort_points(
         to_ground = (dg <= own.min_gap) & (dg <= dl)
         to_level = (there > 0) & ~to_ground & (dl <= own.min_gap)
         above = known & (found.lower > g)
-        shown = torch.where(above, flies | levels.is_open, torch.where(known, scan.ground_floats, hangs))
+        shown = torch.where(known & ~above, scan.ground_floats, flies | (above & levels.is_open))
         if own.separation == "gap":
             shown = shown | known | (rank > 0)
         opens = (there > 0) & ~to_ground & ~to_level & (shown | ramp)
         chosen = torch.zeros_like(levels.support, dtype=torch.bool).scatter(1, nearest[:, None], to_level[:, None])
-        stands = to_level & ~known & (found.lower < levels.lower.gather(1, nearest[:, None])[:, 0]) & ~hangs
+        stands = to_level & ~known & (found.lower < levels.lower.gather(1, nearest[:, None])[:, 0]) & ~flies
         levels = fuse(levels, chosen, found, cfg.fusion.max_support)
         levels, state = found_ground(levels, state, torch.where(stands, nearest, NONE))
         levels, lost = insert(levels, opens, found, 0.0)

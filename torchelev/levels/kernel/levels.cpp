@@ -48,7 +48,7 @@ struct Map {
     int64_t cells, M;
     float g2;  // [m^2] what the disagreement of scans adds to the variance of the ground
     levels::Sights sights;
-    float base[3] = {}, from_below = -INFINITE;  // [m] lowest height at which points are seen from below
+    float base[3] = {};
     bool has_base = false;
     std::vector<int32_t> row, column;  // places of the window's cells in the ring
     int64_t statistics[levels::STATISTICS] = {};
@@ -123,7 +123,6 @@ struct Map {
         for (int64_t s = 0; s < u.S; s++) {
             const places::Frame frame(u, b, u.T_map_sensor + 16 * (b * u.S + s), origin);
             std::copy_n(frame.t, 3, own.sights[s].origin);
-            from_below = std::max(from_below, frame.t[2] + 0.5f * u.min_gap);
             if (!is_sound) {
                 std::fill_n(own.points.cell.begin() + s * u.N, u.N, -1), std::fill_n(own.points.casts.begin() + s * u.N, u.N, 0);
                 continue;
@@ -225,9 +224,6 @@ struct Map {
         return sights.floats(own.x[c / u.W], own.y[c % u.W], top, own.lowest[c]);
     }
 
-    // Whether a surface with its lowest point at this height hangs: rays passed below it, or it was seen from below.
-    bool hangs(int64_t c, float lower) const { return lower > from_below || floats(c, lower); }
-
     bool has_levels(int64_t p) const {
         bool any = false;
         for (int64_t l = 0; l < u.L; l++) any |= u.support[(b * u.L + l) * cells + p] > 0;
@@ -238,7 +234,7 @@ struct Map {
     bool is_simple(int64_t c) const {
         if (has_levels(place(c))) return false;
         const float low = own.bottom[c], high = own.top[c];
-        if (!u.validity[b * cells + c]) return high - low <= u.min_gap && !own.all_above[c] && !hangs(c, low);
+        if (!u.validity[b * cells + c]) return high - low <= u.min_gap && !own.all_above[c] && !floats(c, low);
         const float g = u.elevation[b * cells + c];
         return g - low <= u.min_gap && high - g <= u.min_gap && !floats(c, g);
     }
@@ -341,14 +337,12 @@ struct Map {
             }
             if (to_ground <= u.min_gap && to_ground <= to_level) continue;
             if (to_level <= u.min_gap) {
-                const bool stands = !known && found.lower < cell.lower[nearest * cells] && !hangs(c, found.lower);
+                const bool stands = !known && found.lower < cell.lower[nearest * cells] && !floats(c, found.lower);
                 cell.fuse(nearest, found, u.max_support);
                 if (stands) found_ground(c, nearest), known = true, g = u.elevation[b * cells + c];
             } else {
                 const bool above = known && found.lower > g;
-                bool shown = !known ? hangs(c, found.lower)
-                             : above ? is_open(p) || floats(c, found.lower)
-                                     : ground_floats;
+                bool shown = known && !above ? ground_floats : (above && is_open(p)) || floats(c, found.lower);
                 shown |= clusters[rank].above || (u.by_gap && (known || rank > 0));
                 if (!shown) continue;
                 statistics[levels::DROPPED] += cell.insert(found, 0), statistics[levels::OPENED]++;
