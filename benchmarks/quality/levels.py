@@ -5,9 +5,9 @@
     python -m benchmarks.quality.levels --with vdbfusion --python <an interpreter that has vdbfusion>
 
 A robot with a lidar walks through a scene. Every 12th scan is scored, on the cells whose true ground is even and was
-hit by 3 points: the share whose elevation is that of the right surface, and the RMSE of these. A ceiling is missed if
-its underside was hit by 3 points and the map has none within 0.3 m above it, and false if the map has one 0.3 m below
-it; the RMSE is that of the others.
+hit by 3 points since it entered the window: the share whose elevation is that of the right surface, and the RMSE of
+these. A ceiling is missed if its underside was hit by 3 points and the map has none within 0.3 m above it, and false if
+the map has one 0.3 m below it; the RMSE is that of the others.
 
 Beside other maps, every map gets every third scan. From voxels of 5 cm the ground is found as the truth is: by a way
 from where the robot stands over surfaces with 0.4 m of free height, and over at most 0.5 m of unknown cells. Of
@@ -41,6 +41,7 @@ from benchmarks.quality.levels_scenes import (
     SHAPE,
     VOXEL,
     WALKS,
+    WINDOW,
     Scan,
     Truth,
     choose,
@@ -52,7 +53,7 @@ from benchmarks.quality.levels_scenes import (
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig, LevelsConfig
 from torchelev.app.results import markdown_table, write_json
 
-GRID = GridConfig(resolution=VOXEL, length_x=8.0, length_y=8.0)
+GRID = GridConfig(resolution=VOXEL, length_x=WINDOW * VOXEL, length_y=WINDOW * VOXEL)
 NOISES = {"none": 0.0, "1 cm": 0.01}  # [m] of range
 NOISE = "1 cm"  # beside other maps
 SCORED, SHARED = 12, 3  # every so many scans are scored, and given to other maps

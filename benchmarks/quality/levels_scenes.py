@@ -30,6 +30,7 @@ FREE_HEIGHT, MAX_STEP = 0.4, 0.3  # [m]
 VOXEL = 0.05  # [m], the cells' size too
 ORIGIN = torch.tensor([250, 250, 40])  # index of the voxel whose lowest corner is at 0
 SHAPE = (500, 500, 160)  # voxels
+WINDOW = 160  # cells along a side of the maps
 NEAR = 6.0  # [m] beyond which rays leave every window
 MIN_HITS = 3  # points that make a surface count
 SAMPLE = 20_000  # voxels of each kind and scan that are compared
@@ -150,6 +151,7 @@ def record(walk: Walk, stride: int, scored: int) -> Iterator[Scan]:
         T_sensor[:3, 3] += T_base[:3, :3] @ torch.tensor(MOUNT, dtype=torch.float64)
         points = LIDAR.cast(scene, T_sensor)
         is_scored = k > 0 and k % scored == 0
+        space.enter(xy[k])
         space.add(to_map(points, T_sensor), T_sensor[:3, 3], is_scored)
         yield Scan(
             k, points, T_sensor, T_base, partial(space.truth, foot=float(foot[k]), xy=xy[k]) if is_scored else None
@@ -194,7 +196,16 @@ class _Space:
         self.hits = torch.zeros(2, *SHAPE, dtype=torch.int32)  # by rays that go down, and up
         self.passed = torch.zeros(SHAPE, dtype=torch.bool)
         self.is_clear = _clear(scene)
+        self.corner: list[int] = []
         self.generator = torch.Generator().manual_seed(0)
+
+    def enter(self, xy: Tensor) -> None:
+        """Forget hits in cells that enter the window around a place [m], as the map does not know them any more."""
+        corner = ((xy / VOXEL).round().long() + ORIGIN[:2] - WINDOW // 2).tolist()
+        for axis, (old, new) in enumerate(zip(self.corner or corner, corner, strict=True), 1):
+            first = old + WINDOW if new > old else new
+            self.hits.narrow(axis, first, min(abs(new - old), WINDOW)).zero_()
+        self.corner = corner
 
     def add(self, points: Tensor, origin: Tensor, passes: bool) -> None:
         """Take in the returns (N, 3) [m] of a scan, and what its rays passed."""

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchelev.grid import GridConfig
 from torchelev.levels.config import LevelsConfig
+from torchelev.levels.surfaces import FIRM
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -27,18 +28,29 @@ class Standing(NamedTuple):
 
 
 def find_standing(
-    heights: Float[Tensor, "B K H W"], known: Bool[Tensor, "B K H W"], base: Tensor, square: Tensor
+    heights: Float[Tensor, "B K H W"],
+    known: Bool[Tensor, "B K H W"],
+    support: Float[Tensor, "B K H W"],
+    base: Tensor,
+    square: Tensor,
 ) -> Standing:
-    """Find the highest surface below the base in the cell nearest to it that has one.
+    """Find the highest surface below the base in the cell nearest to it that has one, of FIRM surfaces if there are.
 
     Args:
         heights: of all surfaces [m].
         known: which of them exist.
+        support: points that measured them.
         base: (B, 3) [m]; NaN: none is found.
         square: squared distance of each cell from the base (B, H, W) [m^2].
     """
     below = known & (heights <= base[:, 2, None, None, None])
-    top, surface = torch.where(below, heights, -torch.inf).max(1)
+    firm = _find_nearest(heights, below & (support >= FIRM), square)
+    weak = _find_nearest(heights, below, square)
+    return Standing(*(torch.where(firm.found, a, b) for a, b in zip(firm, weak, strict=True)))
+
+
+def _find_nearest(heights: Tensor, counts: Tensor, square: Tensor) -> Standing:
+    top, surface = torch.where(counts, heights, -torch.inf).max(1)
     far = torch.where(top > -torch.inf, square, torch.inf).flatten(1)
     nearest, cell = far.min(1)
     at = cell[:, None]

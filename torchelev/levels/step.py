@@ -23,7 +23,7 @@ from torchelev.levels.rays import (
     ray_heights,
 )
 from torchelev.levels.state import Levels, LevelStatistics, age, forget_space, move, remove
-from torchelev.levels.surfaces import GATE, Found, distance, fuse, insert, merge
+from torchelev.levels.surfaces import GATE, SETTLED, Found, distance, fuse, insert, merge
 from torchelev.ops.masks import count
 from torchelev.ops.transforms import is_readable
 from torchelev.stages.cells import center_offsets, lattice_offset
@@ -153,7 +153,8 @@ def _sort_points(
         g, known = state.elevation, state.validity
         dg = torch.where(known, distance(found.lower, found.upper, g, g), torch.inf)
         away = distance(found.lower[:, None], found.upper[:, None], levels.lower, levels.upper)
-        dl, nearest = torch.where(levels.support > 0, away, torch.inf).min(1)
+        is_near = away <= torch.where(levels.support < SETTLED, SAME, torch.inf)
+        dl, nearest = torch.where((levels.support > 0) & is_near, away, torch.inf).min(1)
         to_ground = (dg <= own.min_gap) & (dg <= dl)
         to_level = (there > 0) & ~to_ground & (dl <= own.min_gap)
         above = known & (found.lower > g)
@@ -215,7 +216,7 @@ def _seen_through(levels: Levels, scan: _Scan, cfg: ElevationMapConfig) -> Bool[
     """Return the surfaces through which rays passed that were not hit for `raycast.min_time`.
 
     A ray shows it only where it crosses the surface within the cell: a thin one must be met steeply, and passed by more
-    than the noise.
+    than the noise. Surfaces that are not SETTLED go by any ray: they may be wrong returns.
     """
     gone = torch.zeros_like(levels.support, dtype=torch.bool)
     if cfg.raycast is None:
@@ -230,9 +231,11 @@ def _seen_through(levels: Levels, scan: _Scan, cfg: ElevationMapConfig) -> Bool[
             nearest, d = nearest_around(sight, scan.x, scan.y, middle, size)
             slope = (middle - sight.origin[:, 2, None]).abs() / d.clamp(min=size.resolution)
             noise = GATE * levels.variance[:, k].sqrt() + (d / size.elevations) * (1 + slope).square()
+            is_weak = levels.support[:, k] < SETTLED
             is_thick, is_steep = tall >= 2 * noise, MARGIN * size.resolution * slope >= noise
             behind = nearest - d
-            passes = (behind >= MARGIN * size.resolution) & (is_thick | (is_steep & (behind * slope >= noise)))
+            crosses = is_thick | (is_steep & (behind * slope >= noise))
+            passes = (behind >= MARGIN * size.resolution) & (is_weak | crosses)
             through = through | (passes & (nearest < torch.inf) & (d >= NEAREST * size.resolution))
         parts.append(through)
     return old & torch.stack(parts, 1)
@@ -243,6 +246,8 @@ def _choose(
 ) -> tuple[Levels, MapState, Bool[Tensor, "B cells"]]:
     """Make the surface that the robot reaches first the ground, and return where it changed.
 
+    Surfaces of fewer points than the ground do not count, unless they are SETTLED.
+
     Near the robot, ground of another floor that it cannot reach becomes a level too (paper, Sec. II-F, without the
     forgetting).
     """
@@ -251,9 +256,11 @@ def _choose(
     if m.base is None:
         return levels, state, torch.zeros_like(state.validity)
     heights = torch.cat([state.elevation[:, None], levels.upper], 1).unflatten(2, size)
-    known = torch.cat([state.validity[:, None], levels.support >= own.least_support], 1).unflatten(2, size)
+    rival = torch.where(state.validity, state.support.clamp(max=SETTLED), 0.0).clamp(min=own.least_support)
+    known = torch.cat([state.validity[:, None], levels.support >= rival[:, None]], 1).unflatten(2, size)
     square = (scan.x - m.base[:, 0, None]).square() + (scan.y - m.base[:, 1, None]).square()
-    standing = find_standing(heights, known, m.base, square.unflatten(1, size))
+    support = torch.cat([state.support[:, None], levels.support], 1).unflatten(2, size)
+    standing = find_standing(heights, known, support, m.base, square.unflatten(1, size))
     first, reached = choose_ground(heights, known, standing, cfg.grid, own, is_readable(state.elevation))
     levels, state, changed = swap(levels, state, first.flatten(1), cfg)
     if cfg.overlap is not None:

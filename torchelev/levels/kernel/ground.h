@@ -26,6 +26,7 @@ struct Search {
     std::vector<float> guess;         // (cells) [m]
     std::vector<int32_t> blind;       // (cells) cells since the last surface
     std::vector<int32_t> decided_in;  // (cells) the step in which a cell of several surfaces was reached first
+    std::vector<uint16_t> firm;       // (cells) surfaces of many points, a bit each
     std::vector<uint16_t> open;       // (cells) surfaces that were not reached, a bit each, and flags
     std::vector<int8_t> first;        // (cells)
     std::vector<int32_t> wave, next;  // nodes: surface << SHIFT | cell
@@ -41,7 +42,7 @@ struct Search {
 
     void start(int64_t rows, int64_t columns, int surfaces) {
         H = rows, W = columns, pitch = W + 2, cells = (H + 2) * pitch, K = surfaces;
-        height.assign(K * cells, NAN), guess.resize(cells), blind.resize(cells), open.resize(cells);
+        height.assign(K * cells, NAN), guess.resize(cells), blind.resize(cells), open.resize(cells), firm.resize(cells);
         decided_in.resize(cells), first.assign(cells, UNDECIDED);
         if (next.size() <= size_t(K + 1) * cells) wave.resize((K + 1) * cells + 1), next.resize((K + 1) * cells + 1);
     }
@@ -49,14 +50,18 @@ struct Search {
     // The cell of a row and a column of the window.
     int64_t at(int64_t i, int64_t j) const { return (i + 1) * pitch + j + 1; }
 
-    // Find the highest surface below the base in the cell nearest to it that has one.
+    // Find the highest surface below the base in the cell nearest to it that has one, of firm ones if there are.
     Standing find_standing(const float* base, const float* x, const float* y) const {
         const int64_t i = nearest_of(x, H, base[0]), j = nearest_of(y, W, base[1]);
         constexpr int64_t NEAR = 8;
-        float square;
-        Standing best = search(base, x, y, i - NEAR, i + NEAR, j - NEAR, j + NEAR, square);
         const float reach = H > 1 ? (x[1] - x[0]) * (NEAR - 1) : 0;
-        if (!best.found || square > reach * reach) best = search(base, x, y, 0, H - 1, 0, W - 1, square);
+        Standing best;
+        for (const bool is_firm : {true, false}) {
+            float square;
+            best = search(base, x, y, i - NEAR, i + NEAR, j - NEAR, j + NEAR, is_firm, square);
+            if (!best.found || square > reach * reach) best = search(base, x, y, 0, H - 1, 0, W - 1, is_firm, square);
+            if (best.found) break;
+        }
         return best;
     }
 
@@ -96,7 +101,7 @@ struct Search {
     }
 
     Standing search(const float* base, const float* x, const float* y, int64_t i0, int64_t i1, int64_t j0, int64_t j1,
-                    float& square) const {
+                    bool is_firm, float& square) const {
         Standing best;
         square = std::numeric_limits<float>::infinity();
         for (int64_t i = std::max<int64_t>(i0, 0); i <= std::min(i1, H - 1); i++)
@@ -105,6 +110,7 @@ struct Search {
                 if (!(away < square)) continue;
                 for (int k = 0; k < K; k++) {
                     const float h = height[k * cells + at(i, j)];
+                    if (is_firm && !(firm[at(i, j)] >> k & 1)) continue;
                     if (!(h <= base[2]) || (away == square && !(h > best.height))) continue;
                     best = {at(i, j), k, h, true}, square = away;
                 }

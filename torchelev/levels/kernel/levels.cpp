@@ -333,6 +333,7 @@ struct Map {
                 const int64_t q = l * cells;
                 if (!(cell.support[q] > 0)) continue;
                 const float away = levels::distance(found.lower, found.upper, cell.lower[q], cell.upper[q]);
+                if (cell.support[q] < levels::SETTLED && away > SAME) continue;
                 if (away < to_level) to_level = away, nearest = l;
             }
             if (to_ground <= u.min_gap && to_ground <= to_level) continue;
@@ -380,7 +381,7 @@ struct Map {
                 cell.remove(l), numbers[levels::MERGED]++;
             } else if (cell.time[q] > u.min_time) {
                 for (const levels::Sight& sight : own.sights)
-                    if (sight.passes(own.x[c / u.W], own.y[c % u.W], cell.lower[q], cell.upper[q], cell.variance[q], sights.size)) {
+                    if (sight.passes(own.x[c / u.W], own.y[c % u.W], cell.lower[q], cell.upper[q], cell.variance[q], cell.support[q] < levels::SETTLED, sights.size)) {
                         cell.remove(l), numbers[levels::CLEARED]++;
                         break;
                     }
@@ -399,13 +400,19 @@ struct Map {
         for (int64_t i = 0; i < u.H; i++) {
             const int64_t n = b * cells + i * u.W;
             float* to = &search.height[search.at(i, 0)];
+            uint16_t* firm = &search.firm[search.at(i, 0)];
             for (int64_t j = 0; j < u.W; j++) to[j] = u.validity[n + j] ? u.elevation[n + j] : NAN;
+            for (int64_t j = 0; j < u.W; j++) firm[j] = u.ground_support[n + j] >= levels::FIRM;
             for (int64_t l = 0; l < u.L; l++) {
                 const int64_t q = (b * u.L + l) * cells + row[i];
                 to += search.cells;
                 for (int64_t j = 0; j < u.W; j++) {
-                    const bool is_there = u.support[q + column[j]] >= least;
-                    if (is_there) to[j] = u.upper[q + column[j]], any = true;
+                    const bool known = u.validity[n + j];
+                    const float rival = known ? std::min(u.ground_support[n + j], levels::SETTLED) : 0;
+                    const bool is_there = u.support[q + column[j]] >= std::max(least, rival);
+                    if (!is_there) continue;
+                    to[j] = u.upper[q + column[j]], any = true;
+                    firm[j] |= uint16_t((u.support[q + column[j]] >= levels::FIRM) << (l + 1));
                 }
             }
         }
