@@ -12,7 +12,7 @@ the map has one 0.3 m below it; the RMSE is that of the others.
 Beside other maps, every map gets every third scan. From voxels of 5 cm the ground is found as the truth is: by a way
 from where the robot stands over surfaces with 0.4 m of free height, and over at most 0.5 m of unknown cells. Of
 OctoMap a surface is the top of an occupied voxel; of VDBFusion, whose voxels cannot be read, the height at which its
-mesh crosses the middle of a cell. Free space counts if it is a voxel or more from anything. It is called occupied if
+mesh crosses the middle of a cell, and what is lowest over the cell is its ceiling. Free space counts if it is a voxel or more from anything. It is called occupied if
 its own voxel is. Occupied space is called free if its voxel is, and none of the six around is occupied. By a map of
 surfaces, the voxels of surfaces are occupied and those between ground and ceiling are free.
 """
@@ -237,6 +237,7 @@ class VdbFusion:
         is_ground = is_top & (above - heights >= FREE_HEIGHT)
         tops, order = torch.where(is_ground, heights, torch.inf).sort(0)
         ground, ceiling = _ground_of(tops, above.gather(0, order), truth)
+        ceiling = torch.minimum(ceiling, _lowest_above(torch.from_numpy(vertices), ground, truth))
         occupied, none = torch.zeros(SHAPE, dtype=torch.bool), torch.full_like(heights, torch.nan)
         occupied[places(voxels_of(torch.from_numpy(vertices)))] = True
 
@@ -251,6 +252,17 @@ class VdbFusion:
         self.process.stdin.close()
         self.process.wait()
         return self.memory
+
+
+def _lowest_above(vertices: Tensor, ground: Tensor, truth: Truth) -> Tensor:
+    """Return the height of the lowest vertex over each cell that leaves free height; inf for none. Thin things count."""
+    H, W = ground.shape
+    cell = (vertices[:, :2] / VOXEL).floor().long() - truth.first[:2]
+    inside = ((cell >= 0) & (cell < torch.tensor([H, W]))).all(-1)
+    flat, z = (cell[:, 0] * W + cell[:, 1])[inside], vertices[inside, 2]
+    is_above = z >= ground.flatten()[flat] + FREE_HEIGHT
+    lowest = torch.full((H * W,), torch.inf, dtype=torch.float64)
+    return lowest.scatter_reduce(0, flat[is_above], z[is_above], "amin").view(H, W)
 
 
 def _crossings(vertices: Tensor, triangles: Tensor, truth: Truth) -> tuple[Tensor, Tensor]:

@@ -45,7 +45,7 @@ def table(rows: list[dict[str, Any]]) -> str:
     for row in rows:
         if max(abs(worsening(row, name)) for name in COMPARED) > 1e-3:
             (a, b), (c, d) = row["rmse"], row["coverage"]
-            lines.append(f"| {row['case']} | {100 * a:.2f}, {100 * b:.2f} | {100 * c:.2f}, {100 * d:.2f} |")
+            lines.append(f"| {row['case']} | {a / 10:.2f}, {b / 10:.2f} | {100 * c:.2f}, {100 * d:.2f} |")
     worse = [row["case"] for row in rows if max(worsening(row, name) for name in COMPARED) > ALLOWED]
     lines.append(
         f"\n{len(worse)} of {len(rows)} are worse by more than {100 * ALLOWED:.0f} %: {', '.join(worse) or '-'}"

@@ -246,7 +246,7 @@ def _choose(
 ) -> tuple[Levels, MapState, Bool[Tensor, "B cells"]]:
     """Make the surface that the robot reaches first the ground, and return where it changed.
 
-    Surfaces of fewer points than the ground do not count, unless they are SETTLED.
+    Where the ground was hit last, surfaces of fewer points do not count, unless they are SETTLED.
 
     Near the robot, ground of another floor that it cannot reach becomes a level too (paper, Sec. II-F, without the
     forgetting).
@@ -256,8 +256,9 @@ def _choose(
     if m.base is None:
         return levels, state, torch.zeros_like(state.validity)
     heights = torch.cat([state.elevation[:, None], levels.upper], 1).unflatten(2, size)
-    rival = torch.where(state.validity, state.support.clamp(max=SETTLED), 0.0).clamp(min=own.least_support)
-    known = torch.cat([state.validity[:, None], levels.support >= rival[:, None]], 1).unflatten(2, size)
+    has_rival = state.validity[:, None] & (state.time[:, None] <= levels.time)
+    rival = torch.where(has_rival, state.support.clamp(max=SETTLED)[:, None], 0.0).clamp(min=own.least_support)
+    known = torch.cat([state.validity[:, None], levels.support >= rival], 1).unflatten(2, size)
     square = (scan.x - m.base[:, 0, None]).square() + (scan.y - m.base[:, 1, None]).square()
     support = torch.cat([state.support[:, None], levels.support], 1).unflatten(2, size)
     standing = find_standing(heights, known, support, m.base, square.unflatten(1, size))

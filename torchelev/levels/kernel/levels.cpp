@@ -407,8 +407,8 @@ struct Map {
                 const int64_t q = (b * u.L + l) * cells + row[i];
                 to += search.cells;
                 for (int64_t j = 0; j < u.W; j++) {
-                    const bool known = u.validity[n + j];
-                    const float rival = known ? std::min(u.ground_support[n + j], levels::SETTLED) : 0;
+                    const bool has_rival = u.validity[n + j] && u.ground_time[n + j] <= u.time[q + column[j]];
+                    const float rival = has_rival ? std::min(u.ground_support[n + j], levels::SETTLED) : 0;
                     const bool is_there = u.support[q + column[j]] >= std::max(least, rival);
                     if (!is_there) continue;
                     to[j] = u.upper[q + column[j]], any = true;
