@@ -12,9 +12,10 @@ the map has one 0.3 m below it; the RMSE is that of the others.
 Beside other maps, every map gets every third scan. From voxels of 5 cm the ground is found as the truth is: by a way
 from where the robot stands over surfaces with 0.4 m of free height, and over at most 0.5 m of unknown cells. Of
 OctoMap a surface is the top of an occupied voxel; of VDBFusion, whose voxels cannot be read, the height at which its
-mesh crosses the middle of a cell, and what is lowest over the cell is its ceiling. Free space counts if it is a voxel or more from anything. It is called occupied if
-its own voxel is. Occupied space is called free if its voxel is, and none of the six around is occupied. By a map of
-surfaces, the voxels of surfaces are occupied and those between ground and ceiling are free.
+mesh crosses the middle of a cell, and what is lowest over the cell is its ceiling. Free space counts if it is a voxel
+or more from anything. It is called occupied if its own voxel is. Occupied space is called free if its voxel is, and
+none of the six around is occupied or below the ground. By a map of surfaces, the voxels of surfaces are occupied and
+those between ground and ceiling are free; with one surface, all above it are.
 """
 
 from __future__ import annotations
@@ -255,7 +256,7 @@ class VdbFusion:
 
 
 def _lowest_above(vertices: Tensor, ground: Tensor, truth: Truth) -> Tensor:
-    """Return the height of the lowest vertex over each cell that leaves free height; inf for none. Thin things count."""
+    """Return the height of the lowest vertex over each cell that leaves free height, inf for none."""
     H, W = ground.shape
     cell = (vertices[:, :2] / VOXEL).floor().long() - truth.first[:2]
     inside = ((cell >= 0) & (cell < torch.tensor([H, W]))).all(-1)
@@ -433,6 +434,8 @@ def main() -> None:
     arguments = parser.parse_args()
     if "octomap" in arguments.libraries and importlib.util.find_spec("pyoctomap") is None:
         parser.error("--with octomap: needs the package pyoctomap, got none; pip install pyoctomap")
+    if "vdbfusion" in arguments.libraries and subprocess.run([arguments.python, "-c", "import vdbfusion"]).returncode:
+        parser.error("--with vdbfusion: needs the package vdbfusion, got none; give --python one that has it")
     result = measure(arguments.libraries, arguments.python)
     write_json(
         RESULTS / "levels.json", {"every": SCORED, "shared": SHARED, "threads": torch.get_num_threads()} | result

@@ -31,6 +31,7 @@ QUICK = {
     "mujoco_depth_camera": "--steps 30",
     "own_head": "--batches 1 --steps 2",
     "plan_around_water": "--quick",
+    "under_a_table": "--quick",
     "planning": "--quick",
     "robot_50hz": "--seconds 1 --eager",
     "world_map": "--steps 20",

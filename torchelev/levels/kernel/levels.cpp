@@ -83,6 +83,23 @@ struct Map {
     uint8_t& is_open(int64_t p) const { return u.is_open[b * cells + p]; }
     void forget_space(int64_t p) const { free_top(p) = -INFINITE, is_open(p) = 0; }
 
+    struct Range {
+        int64_t begin, end;
+    };
+    // Which rows or columns of a window were in it before.
+    static Range staying(int64_t now, int64_t before, int64_t size) {
+        const int64_t begin = std::clamp<int64_t>(before - now, 0, size), end = std::clamp<int64_t>(before - now + size, 0, size);
+        return {begin, std::max(begin, end)};
+    }
+
+    // Call `work(j, p, number)` for the two stretches of a row whose cells lie side by side in the ring, too: from column
+    // j of the window and place p.
+    template <class Work> void for_stretches(int64_t i, const Work& work) const {
+        const int64_t first = column[0], number = u.W - first;
+        work(int64_t(0), row[i] + first, number);
+        if (first > 0) work(number, int64_t(row[i]), first);
+    }
+
     // Move to the window of the map, and age: `move`, `age`.
     void follow() {
         const int64_t *now = u.corner + 2 * b, size[] = {u.H, u.W};
@@ -90,11 +107,11 @@ struct Map {
         row.resize(u.H), column.resize(u.W);
         for (int64_t i = 0; i < u.H; i++) row[i] = int32_t(ring(now[0] + i, u.H) * u.W);
         for (int64_t j = 0; j < u.W; j++) column[j] = int32_t(ring(now[1] + j, u.W));
-        auto enters = [&](int axis, int64_t k) { return now[axis] + k < before[axis] || now[axis] + k >= before[axis] + size[axis]; };
+        const Range rows = staying(now[0], before[0], u.H), columns = staying(now[1], before[1], u.W);
         for (int64_t i = 0; i < u.H; i++) {
-            const bool all = enters(0, i);
-            for (int64_t j = 0; j < u.W; j++)
-                if (all || enters(1, j)) blank(row[i] + column[j]);
+            const bool stays = i >= rows.begin && i < rows.end;
+            for (int64_t j = 0; j < (stays ? columns.begin : u.W); j++) blank(row[i] + column[j]);
+            for (int64_t j = columns.end; stays && j < u.W; j++) blank(row[i] + column[j]);
         }
         for (int axis = 0; axis < 2; axis++) before[axis] = now[axis];
         const float dt = u.dt[b] > 0 && u.dt[b] < INFINITE ? u.dt[b] : 0, added = u.variance_rate * dt;
@@ -358,16 +375,28 @@ struct Map {
         parts(u.H, [&](int64_t, int64_t begin, int64_t end) {
             int64_t of_part[levels::STATISTICS] = {};
             for (int64_t i = begin; i < end; i++)
-                for (int64_t j = 0; j < u.W; j++) {
-                    const int64_t c = i * u.W + j, p = row[i] + column[j];
-                    const float g = u.elevation[b * cells + c], high = own.highest[c];
-                    free_top(p) = std::max(free_top(p), high);
-                    is_open(p) |= u.validity[b * cells + c] & (own.lowest[c] < g + 0.5f * u.min_gap) & (high >= g + u.min_gap);
-                    if (has_levels(p)) tidy_cell(c, p, of_part);
-                }
+                for_stretches(i, [&](int64_t j, int64_t p, int64_t number) { tidy_stretch(i * u.W + j, p, number, of_part); });
             merged += of_part[levels::MERGED], cleared += of_part[levels::CLEARED];
         });
         statistics[levels::MERGED] += merged, statistics[levels::CLEARED] += cleared;
+    }
+
+    void tidy_stretch(int64_t first, int64_t p, int64_t number, int64_t* numbers) const {
+        const float *g = u.elevation + b * cells + first, gap = u.min_gap;
+        const float *high = &own.highest[first], *low = &own.lowest[first];
+        const uint8_t* known = u.validity + b * cells + first;
+        float* __restrict top = &free_top(p);
+        uint8_t* __restrict open = &is_open(p);
+        for (int64_t n = 0; n < number; n++) top[n] = std::max(top[n], high[n]);
+        for (int64_t n = 0; n < number; n++)
+            open[n] |= known[n] & uint8_t((low[n] < g[n] + 0.5f * gap) & (high[n] >= g[n] + gap));
+        float most = 0;  // mostly 0: no cell of the stretch has levels
+        for (int64_t l = 0; l < u.L; l++) {
+            const float* support = u.support + (b * u.L + l) * cells + p;
+            for (int64_t n = 0; n < number; n++) most = std::max(most, support[n]);
+        }
+        for (int64_t n = 0; most > 0 && n < number; n++)
+            if (has_levels(p + n)) tidy_cell(first + n, p + n, numbers);
     }
 
     void tidy_cell(int64_t c, int64_t p, int64_t* numbers) const {
@@ -391,7 +420,22 @@ struct Map {
 
     // Choosing the ground ----------------------------------------------------------------------------------------
 
+    // Whether any cell has levels, or heights differ as those of two floors do.
+    bool has_choice() const {
+        const float *support = u.support + b * u.L * cells, *elevation = u.elevation + b * cells;
+        const uint8_t* known = u.validity + b * cells;
+        float most = 0, highest = -INFINITE, lowest = INFINITE;
+        for (int64_t k = 0; k < u.L * cells; k++) most = std::max(most, support[k]);
+        if (most > 0) return true;
+        for (int64_t c = 0; c < cells; c++) {
+            highest = std::max(highest, known[c] ? elevation[c] : -INFINITE);
+            lowest = std::min(lowest, known[c] ? elevation[c] : INFINITE);
+        }
+        return u.overlap_radius > 0 && highest - lowest > u.overlap_height;
+    }
+
     void choose() {
+        if (!has_choice()) return;
         levels::Search& search = own.search;
         search.start(u.H, u.W, int(u.L) + 1);
         search.max_step = u.max_step, search.rise = float(levels::SLOPE * u.resolution), search.max_blind = u.max_blind;
