@@ -9,12 +9,13 @@ from torch import Tensor
 
 from torchelev.grid import GridConfig
 from torchelev.levels.config import LevelsConfig
-from torchelev.levels.surfaces import FIRM
+from torchelev.levels.surfaces import SETTLED
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
 SLOPE = 0.5  # by which unknown ground may rise
+NEAR = 1.0  # [m] within which a robot stands
 NONE = -1
 
 
@@ -34,7 +35,9 @@ def find_standing(
     base: Tensor,
     square: Tensor,
 ) -> Standing:
-    """Find the highest surface below the base in the cell nearest to it that has one, of FIRM surfaces if there are.
+    """Find the highest surface below the base in the cell nearest to it that has one.
+
+    Within NEAR, cells whose highest surface is SETTLED come before others.
 
     Args:
         heights: of all surfaces [m].
@@ -44,18 +47,16 @@ def find_standing(
         square: squared distance of each cell from the base (B, H, W) [m^2].
     """
     below = known & (heights <= base[:, 2, None, None, None])
-    firm = _find_nearest(heights, below & (support >= FIRM), square)
-    weak = _find_nearest(heights, below, square)
-    return Standing(*(torch.where(firm.found, a, b) for a, b in zip(firm, weak, strict=True)))
-
-
-def _find_nearest(heights: Tensor, counts: Tensor, square: Tensor) -> Standing:
-    top, surface = torch.where(counts, heights, -torch.inf).max(1)
-    far = torch.where(top > -torch.inf, square, torch.inf).flatten(1)
-    nearest, cell = far.min(1)
-    at = cell[:, None]
-    height, found = top.flatten(1).gather(1, at)[:, 0], nearest < torch.inf
-    return Standing(cell, surface.flatten(1).gather(1, at)[:, 0], torch.where(found, height, 0.0), found)
+    top, surface = torch.where(below, heights, -torch.inf).max(1)
+    is_firm = support.gather(1, surface[:, None])[:, 0] >= SETTLED
+    far = torch.where(top > -torch.inf, square, torch.inf)
+    settled = torch.where(is_firm & (far <= NEAR**2), far, torch.inf).flatten(1).min(1)
+    nearest = far.flatten(1).min(1)
+    is_settled = settled.values < torch.inf
+    cell = torch.where(is_settled, settled.indices, nearest.indices)
+    found = nearest.values < torch.inf
+    height, surface = (value.flatten(1).gather(1, cell[:, None])[:, 0] for value in (top, surface))
+    return Standing(cell, surface, torch.where(found, height, 0.0), found)
 
 
 class _Wave(NamedTuple):

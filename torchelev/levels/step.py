@@ -216,7 +216,7 @@ def _seen_through(levels: Levels, scan: _Scan, cfg: ElevationMapConfig) -> Bool[
     """Return the surfaces through which rays passed that were not hit for `raycast.min_time`.
 
     A ray shows it only where it crosses the surface within the cell: a thin one must be met steeply, and passed by more
-    than the noise. Surfaces that are not SETTLED go by any ray: they may be wrong returns.
+    than the noise and the height of a bin of directions.
     """
     gone = torch.zeros_like(levels.support, dtype=torch.bool)
     if cfg.raycast is None:
@@ -230,12 +230,11 @@ def _seen_through(levels: Levels, scan: _Scan, cfg: ElevationMapConfig) -> Bool[
         for sight in scan.sights:
             nearest, d = nearest_around(sight, scan.x, scan.y, middle, size)
             slope = (middle - sight.origin[:, 2, None]).abs() / d.clamp(min=size.resolution)
-            noise = GATE * levels.variance[:, k].sqrt() + (d / size.elevations) * (1 + slope).square()
-            is_weak = levels.support[:, k] < SETTLED
-            is_thick, is_steep = tall >= 2 * noise, MARGIN * size.resolution * slope >= noise
+            noise = GATE * levels.variance[:, k].sqrt() + (2 * d / size.elevations) * (1 + slope).square()
+            is_thick, is_steep = tall >= 2 * noise, 2 * MARGIN * size.resolution * slope >= noise
             behind = nearest - d
             crosses = is_thick | (is_steep & (behind * slope >= noise))
-            passes = (behind >= MARGIN * size.resolution) & (is_weak | crosses)
+            passes = (behind >= MARGIN * size.resolution) & crosses
             through = through | (passes & (nearest < torch.inf) & (d >= NEAREST * size.resolution))
         parts.append(through)
     return old & torch.stack(parts, 1)

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 
 GATE = 3.0  # standard deviations between heights that are the same
 SETTLED = 10.0  # points from which on a surface is no handful of wrong returns
-FIRM = 30.0  # points of a surface on which a robot is taken to stand
 
 
 class Found(NamedTuple):

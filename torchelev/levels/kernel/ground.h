@@ -1,6 +1,7 @@
 // Which surface of each cell is the ground: ground.py, with the same names.
 #pragma once
 
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <limits>
@@ -9,7 +10,7 @@
 
 namespace levels {
 
-constexpr float SLOPE = 0.5f;
+constexpr float SLOPE = 0.5f, NEAR = 1.0f;
 constexpr int8_t NONE = -1, UNDECIDED = -2;
 
 struct Standing {
@@ -50,19 +51,27 @@ struct Search {
     // The cell of a row and a column of the window.
     int64_t at(int64_t i, int64_t j) const { return (i + 1) * pitch + j + 1; }
 
-    // Find the highest surface below the base in the cell nearest to it that has one, of firm ones if there are.
+    // Find the highest surface below the base in the cell nearest to it that has one, or in the nearest within NEAR
+    // where that has many points.
     Standing find_standing(const float* base, const float* x, const float* y) const {
         const int64_t i = nearest_of(x, H, base[0]), j = nearest_of(y, W, base[1]);
-        constexpr int64_t NEAR = 8;
-        const float reach = H > 1 ? (x[1] - x[0]) * (NEAR - 1) : 0;
-        Standing best;
-        for (const bool is_firm : {true, false}) {
-            float square;
-            best = search(base, x, y, i - NEAR, i + NEAR, j - NEAR, j + NEAR, is_firm, square);
-            if (!best.found || square > reach * reach) best = search(base, x, y, 0, H - 1, 0, W - 1, is_firm, square);
-            if (best.found) break;
+        const float step = H > 1 ? x[1] - x[0] : 1;
+        const int64_t around = int64_t(std::ceil(NEAR / step)) + 1;
+        float square;
+        const Standing settled = search(base, x, y, i - around, i + around, j - around, j + around, true, square);
+        if (settled.found && square <= NEAR * NEAR) return settled;
+        const Standing weak = search(base, x, y, i - around, i + around, j - around, j + around, false, square);
+        return weak.found && square <= NEAR * NEAR ? weak : search(base, x, y, 0, H - 1, 0, W - 1, false, square);
+    }
+
+    // Whether one of these levels (nodes) lies beside ground that is within a step of it: else none can be reached.
+    bool touches_ground(const std::vector<int32_t>& nodes) const {
+        for (const int32_t node : nodes) {
+            const int64_t c = node % cells;
+            for (const int64_t beside : {c - pitch, c + pitch, c - 1, c + 1})
+                if (std::fabs(height[beside] - height[node]) <= max_step) return true;
         }
-        return best;
+        return false;
     }
 
     // Search until the cells of several surfaces are reached; `is_whole`: until all are.
@@ -108,12 +117,13 @@ struct Search {
             for (int64_t j = std::max<int64_t>(j0, 0); j <= std::min(j1, W - 1); j++) {
                 const float dx = x[i] - base[0], dy = y[j] - base[1], away = dx * dx + dy * dy;
                 if (!(away < square)) continue;
+                int top = -1;
                 for (int k = 0; k < K; k++) {
                     const float h = height[k * cells + at(i, j)];
-                    if (is_firm && !(firm[at(i, j)] >> k & 1)) continue;
-                    if (!(h <= base[2]) || (away == square && !(h > best.height))) continue;
-                    best = {at(i, j), k, h, true}, square = away;
+                    if (h <= base[2] && (top < 0 || h > height[top * cells + at(i, j)])) top = k;
                 }
+                if (top < 0 || (is_firm && !(firm[at(i, j)] >> top & 1))) continue;
+                best = {at(i, j), top, height[top * cells + at(i, j)], true}, square = away;
             }
         return best;
     }

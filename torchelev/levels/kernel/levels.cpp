@@ -24,6 +24,7 @@ struct Scratch {
     std::vector<uint8_t> all_above, changed;   // (H W)
     std::vector<uint8_t> simple;               // of `touched`
     std::vector<int32_t> touched, complex, first, sorted;
+    std::vector<int32_t> there;                // level * cells + cell, of the search
     levels::Search search;
 };
 
@@ -410,7 +411,7 @@ struct Map {
                 cell.remove(l), numbers[levels::MERGED]++;
             } else if (cell.time[q] > u.min_time) {
                 for (const levels::Sight& sight : own.sights)
-                    if (sight.passes(own.x[c / u.W], own.y[c % u.W], cell.lower[q], cell.upper[q], cell.variance[q], cell.support[q] < levels::SETTLED, sights.size)) {
+                    if (sight.passes(own.x[c / u.W], own.y[c % u.W], cell.lower[q], cell.upper[q], cell.variance[q], sights.size)) {
                         cell.remove(l), numbers[levels::CLEARED]++;
                         break;
                     }
@@ -439,14 +440,14 @@ struct Map {
         levels::Search& search = own.search;
         search.start(u.H, u.W, int(u.L) + 1);
         search.max_step = u.max_step, search.rise = float(levels::SLOPE * u.resolution), search.max_blind = u.max_blind;
-        bool any = false;
+        own.there.clear();
         const float least = std::max(u.min_support, 0.5f);
         for (int64_t i = 0; i < u.H; i++) {
             const int64_t n = b * cells + i * u.W;
             float* to = &search.height[search.at(i, 0)];
             uint16_t* firm = &search.firm[search.at(i, 0)];
             for (int64_t j = 0; j < u.W; j++) to[j] = u.validity[n + j] ? u.elevation[n + j] : NAN;
-            for (int64_t j = 0; j < u.W; j++) firm[j] = u.ground_support[n + j] >= levels::FIRM;
+            for (int64_t j = 0; j < u.W; j++) firm[j] = u.ground_support[n + j] >= levels::SETTLED;
             for (int64_t l = 0; l < u.L; l++) {
                 const int64_t q = (b * u.L + l) * cells + row[i];
                 to += search.cells;
@@ -455,14 +456,14 @@ struct Map {
                     const float rival = has_rival ? std::min(u.ground_support[n + j], levels::SETTLED) : 0;
                     const bool is_there = u.support[q + column[j]] >= std::max(least, rival);
                     if (!is_there) continue;
-                    to[j] = u.upper[q + column[j]], any = true;
-                    firm[j] |= uint16_t((u.support[q + column[j]] >= levels::FIRM) << (l + 1));
+                    to[j] = u.upper[q + column[j]], own.there.push_back(int32_t((l + 1) * search.cells + search.at(i, j)));
+                    firm[j] |= uint16_t((u.support[q + column[j]] >= levels::SETTLED) << (l + 1));
                 }
             }
         }
         const levels::Standing standing = search.find_standing(base, own.x.data(), own.y.data());
         const bool strange = has_strange(standing);
-        if (!any && !strange) return;
+        if (!strange && !standing.surface && !search.touches_ground(own.there)) return;
         search.run(standing, strange);
         own.changed.assign(cells, 0);
         for (int64_t i = 0; i < u.H; i++)

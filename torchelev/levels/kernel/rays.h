@@ -89,16 +89,16 @@ struct Sight {
     }
 
     // Whether rays passed through a surface of a cell: `_seen_through`.
-    bool passes(float x, float y, float low, float high, float variance, bool is_weak, const SightGrid& size) const {
+    bool passes(float x, float y, float low, float high, float variance, const SightGrid& size) const {
         const float middle = 0.5f * (low + high);
         float d;
         const float found = nearest_around(x, y, middle, size, d);
         const float slope = std::fabs(middle - origin[2]) / std::max(d, size.resolution);
-        const float noise = 3.0f * std::sqrt(variance) + (d / float(size.elevations)) * ((1 + slope) * (1 + slope));
-        const bool is_thick = high - low >= 2 * noise, is_steep = MARGIN * size.resolution * slope >= noise;
+        const float noise = 3.0f * std::sqrt(variance) + (2 * d / float(size.elevations)) * ((1 + slope) * (1 + slope));
+        const bool is_thick = high - low >= 2 * noise, is_steep = 2 * MARGIN * size.resolution * slope >= noise;
         const float behind = found - d;
         const bool crosses = is_thick || (is_steep && behind * slope >= noise);
-        return behind >= MARGIN * size.resolution && (is_weak || crosses) && found < INFINITE && d >= NEAREST * size.resolution;
+        return behind >= MARGIN * size.resolution && crosses && found < INFINITE && d >= NEAREST * size.resolution;
     }
 };
 

@@ -6,7 +6,7 @@
 
 namespace levels {
 
-constexpr float GATE = 3.0f, SETTLED = 10.0f, FIRM = 30.0f;
+constexpr float GATE = 3.0f, SETTLED = 10.0f;
 
 struct Found {
     float lower, upper, mean, variance, noise, number;
