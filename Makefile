@@ -15,7 +15,7 @@ ISAACLAB := .venv-isaaclab
 NEWTON := .venv-newton
 GENESIS := .venv-genesis
 
-.PHONY: help wheel demo test test-fast test-library test-mjlab test-mujoco train-mjlab test-isaaclab bench-isaaclab test-newton test-genesis test-ros2 test-ros2-torch bench-ros2 matrix lint types setup bench quality quality-em-cupy quality-odometry runtime docs clean
+.PHONY: help wheel demo test test-fast test-library test-mjlab test-mujoco train-mjlab test-isaaclab bench-isaaclab test-newton test-genesis test-ros2 test-ros2-torch bench-ros2 matrix lint types setup bench quality quality-em-cupy quality-levels quality-odometry runtime docs clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 12
@@ -172,6 +172,12 @@ quality: setup  ## measure accuracy and features, five minutes
 # GOLDENS: folder of what elevation_mapping_cupy's kernels computed, and beside it the weights of its filter
 quality-em-cupy: setup  ## compare maps with those of elevation_mapping_cupy: GOLDENS=<folder>
 	$(BIN)/python -m benchmarks.quality.em_cupy $(GOLDENS)/em_cupy/open --weights $(GOLDENS)/traversability_filter_weights.npz
+	$(BIN)/python -m docs.readme_tables
+
+quality-levels: setup  ## measure maps with levels in exact scenes, and their cost, ten minutes
+	$(BIN)/python -m benchmarks.quality.levels
+	$(BIN)/python -m benchmarks.quality.levels_accuracy
+	$(BIN)/python -m benchmarks.speed.levels
 	$(BIN)/python -m docs.readme_tables
 
 quality-odometry: setup  ## measure maps whose poses come from the clouds, five minutes

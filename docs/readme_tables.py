@@ -18,7 +18,15 @@ from typing import Any
 import benchmarks
 import training
 from benchmarks.gpu import report as gpu
-from benchmarks.quality import classes, em_cupy, mjlab_task, mjlab_training, pose_covariance
+from benchmarks.quality import (
+    classes,
+    em_cupy,
+    levels,
+    levels_accuracy,
+    mjlab_task,
+    mjlab_training,
+    pose_covariance,
+)
 from benchmarks.quality.changes import report as changes
 from benchmarks.quality.isaac_lab import report as isaac_lab
 from benchmarks.quality.odometry import report as odometry
@@ -40,6 +48,7 @@ from benchmarks.speed import (
     sensors,
     sight,
 )
+from benchmarks.speed import levels as levels_speed
 from benchmarks.speed.postprocessing import __main__ as postprocessing
 from benchmarks.speed.site import site_area, site_merge, site_ranks
 from benchmarks.speed.update import tables
@@ -200,6 +209,9 @@ TABLES = {
     "mjlab": _made_by(mjlab_task.table, "mjlab"),
     "channels": _made_by(channels.table, "channels"),
     "classes": _made_by(classes.table, "classes"),
+    "levels": _made_by(levels.table, "levels"),
+    "levels_accuracy": _made_by(levels_accuracy.table, "levels_accuracy", "rows"),
+    "levels_speed": _made_by(levels_speed.table, "levels_speed"),
     "em_cupy": _made_by(em_cupy.table, "em_cupy"),
     "mjlab_training": _made_by(mjlab_training.table, "mjlab_training"),
     "isaac_lab": _made_by(isaac_lab.table, "isaac_lab"),

@@ -307,7 +307,7 @@ class ElevationMap(RestartableMap):
         kinds: dict[str, Any] = dict(device=self.device, num_links=len(self._links), dtype=dtype, pose_dtype=pose_dtype)
         with torch.inference_mode(False), torch.no_grad():
             inputs = placeholder_inputs(self.num_envs, S, N, with_base=base, with_variance=variance, **kinds)
-            inputs = self._check_inputs(*inputs)
+            inputs = self._check_inputs(*inputs[: Inputs._fields.index("aside")])
         self._update_scratch(inputs)
 
     def _update_scratch(self, inputs: Inputs) -> None:

@@ -12,9 +12,11 @@ from torchelev import ElevationMap, ElevationMapConfig, GridConfig, HeightScan, 
 from torchelev.io.export import load_map, load_npz, save_map, save_npz, take
 from torchelev.io.grid_map import from_grid_map, to_grid_map
 from torchelev.observations import VoxelCrop
+from torchelev.observations.scan_layout import scan_layout
 from torchelev.planning.footprint import FootprintConfig, check_footprint
 from torchelev.planning.planner import plan
 from torchelev.planning.traversal_cost import TraversalCostConfig, traversal_cost
+from torchelev.runtime.bundle.groups import require_heights
 from torchelev.sim.exact import covered_scenes
 from torchelev.sim.exact.scenes import Box, Scene, block
 from torchelev.viz.live.snapshot import take_snapshot
@@ -223,3 +225,12 @@ def test_settings_reach_the_map():
     emap = ElevationMap(cfg)
     assert emap.levels.lower.shape == (1, 4, 20, 20)
     assert dataclasses.replace(cfg, levels=None).levels is None
+
+
+def test_bundles_refuse_what_the_c_library_lacks():
+    scan, image = HeightScan.grid(surface="ceiling"), MapImage(layers=("clearance",))
+    for group in (scan, image):
+        with pytest.raises(ValueError, match="no ceilings"):
+            require_heights({"above": group})
+    assert "surface" in scan_layout(scan)
+    assert "surface" not in scan_layout(HeightScan.grid())

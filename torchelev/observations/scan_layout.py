@@ -12,7 +12,8 @@ from torchelev.observations.scan_settings import ScanSettings
 
 # Noise belongs to training, reach to the map's window; the placement follows from the pattern.
 _LEFT_OUT = ("noise", "noise_after_clip", "reach", "placement")
-_CHANNELS = ("channels", "channel_fill")  # which layouts of policies that read heights alone do not name
+# Layouts of policies that read the heights of the ground alone do not name these.
+_CHANNELS, _CEILING = ("channels", "channel_fill"), ("surface", "no_ceiling")
 _DIGITS = 6  # of a pattern's coordinates [m]
 
 
@@ -21,7 +22,7 @@ def scan_layout(scan: ScanSettings) -> dict[str, Any]:
 
     Store it with a policy, and check it with `require_layout` where the policy is deployed.
     """
-    left_out = (*_LEFT_OUT, *(() if scan.channels else _CHANNELS))
+    left_out = (*_LEFT_OUT, *(() if scan.channels else _CHANNELS), *(_CEILING if scan.surface == "ground" else ()))
     names = [field.name for field in dataclasses.fields(scan) if field.name not in left_out]
     pattern = [[round(x, _DIGITS), round(y, _DIGITS)] for x, y in scan.pattern]
     return {name: pattern if name == "pattern" else to_json(getattr(scan, name)) for name in names}

@@ -15,8 +15,8 @@ from torchelev.observations.scan_layout import scan_layout
 #: of a group: the names of its entries if the robot gives them itself, else what reads the map
 Group = HeightScan | MapImage | Sequence[str]
 
-_CHANNELS = ("channels", "channel_fill")  # which `require_heights` refuses
-_IMAGE_SETTINGS = [field.name for field in dataclasses.fields(MapImage) if field.init and field.name not in _CHANNELS]
+_REFUSED = ("channels", "channel_fill", "max_clearance")  # settings of what `require_heights` refuses
+_IMAGE_SETTINGS = [field.name for field in dataclasses.fields(MapImage) if field.init and field.name not in _REFUSED]
 
 
 def shape_of(group: Group) -> tuple[int, ...]:
@@ -50,11 +50,15 @@ def image_settings(image: MapImage) -> dict[str, Any]:
 
 
 def require_heights(groups: Mapping[str, Group]) -> None:
-    """Refuse groups that read channels, which neither recordings nor the C library hold."""
+    """Refuse groups that read channels or ceilings, which neither recordings nor the C library hold."""
     for name, group in groups.items():
         channels = group.channels if isinstance(group, HeightScan | MapImage) else ()
         rule, hint = "must read no channels, which bundles do not hold", "leave channels out"
         require(not channels, f"groups.{name}.channels", rule, channels, hint)
+        reads_ceiling = isinstance(group, HeightScan) and group.surface == "ceiling"
+        reads_ceiling = reads_ceiling or (isinstance(group, MapImage) and "clearance" in group.layers)
+        rule, hint = "must read no ceilings, which bundles do not hold", "leave it out"
+        require(not reads_ceiling, f"groups.{name}", rule, "one of ceilings", hint)
 
 
 def from_json(where: str, rows: Any) -> dict[str, Group]:
