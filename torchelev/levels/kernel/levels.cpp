@@ -11,7 +11,7 @@
 namespace {
 
 using levels::Cell, levels::Found, levels::INFINITE, levels::Points, levels::Update, places::TINY;
-constexpr int64_t BLOCK = 64;
+constexpr int64_t BLOCK = 64, FEW = 32;  // points that are measured at a time; points that insertion sorts fastest
 constexpr float SAME = 0.1f;
 
 // Memory of a thread, kept between updates.
@@ -277,13 +277,30 @@ struct Map {
             const int32_t c = own.points.cell[m];
             if (c >= 0 && own.list[c] >= 0) own.sorted[next[own.list[c]]++] = int32_t(m);
         }
-        for (size_t k = 0; k < own.complex.size(); k++) sort_cell(own.complex[k], own.first[k], own.first[k + 1]);
+        std::atomic<int64_t> opened{0}, dropped{0};
+        parts(int64_t(own.complex.size()), [&](int64_t, int64_t begin, int64_t end) {
+            int64_t of_part[levels::STATISTICS] = {};
+            for (int64_t k = begin; k < end; k++) sort_cell(own.complex[k], own.first[k], own.first[k + 1], of_part);
+            opened += of_part[levels::OPENED], dropped += of_part[levels::DROPPED];
+        });
+        statistics[levels::OPENED] += opened, statistics[levels::DROPPED] += dropped;
     }
 
     // The clusters of a cell from below: `find_clusters`.
     void find_clusters(int64_t begin, int64_t end, std::vector<Cluster>& clusters) {
         const std::vector<float>& z = own.points.z;
-        std::stable_sort(own.sorted.begin() + begin, own.sorted.begin() + end, [&](int32_t a, int32_t c) { return z[a] < z[c]; });
+        const auto is_lower = [&](int32_t a, int32_t c) { return z[a] < z[c]; };
+        int32_t* const order = own.sorted.data();
+        if (end - begin > FEW) {
+            std::stable_sort(order + begin, order + end, is_lower);
+        } else {
+            for (int64_t k = begin + 1; k < end; k++) {
+                const int32_t m = order[k];
+                int64_t to = k;
+                for (; to > begin && is_lower(m, order[to - 1]); to--) order[to] = order[to - 1];
+                order[to] = m;
+            }
+        }
         clusters.clear();
         for (int64_t k = begin; k < end; k++) {
             const int32_t m = own.sorted[k];
@@ -330,7 +347,7 @@ struct Map {
     void forget_ground(int64_t c) const { u.validity[b * cells + c] = 0, u.challenger_support[b * cells + c] = 0; }
 
     // Sort the points of a cell, by their places in `sorted`: `_sort_points`.
-    void sort_cell(int64_t c, int64_t begin, int64_t end) {
+    void sort_cell(int64_t c, int64_t begin, int64_t end, int64_t* numbers) {
         static thread_local std::vector<Cluster> clusters;
         find_clusters(begin, end, clusters);
         const int64_t p = place(c);
@@ -339,8 +356,8 @@ struct Map {
         bool known = u.validity[b * cells + c];
         const bool ground_floats = known && floats(c, g);
         if (ground_floats && shows_ground(clusters, g)) {
-            statistics[levels::DROPPED] += cell.insert(ground_of(c), u.ground_time[b * cells + c]);
-            statistics[levels::OPENED]++, known = false, forget_ground(c), is_open(p) = 0;
+            numbers[levels::DROPPED] += cell.insert(ground_of(c), u.ground_time[b * cells + c]);
+            numbers[levels::OPENED]++, known = false, forget_ground(c), is_open(p) = 0;
         }
         for (size_t rank = 0; rank < clusters.size() && rank < size_t(2 * (u.L + 1)); rank++) {
             const Found found = clusters[rank].found(u.variance_floor);
@@ -364,7 +381,7 @@ struct Map {
                 bool shown = known && !above ? ground_floats : (above && is_open(p)) || floats(c, found.lower);
                 shown |= clusters[rank].above || (u.by_gap && (known || rank > 0));
                 if (!shown) continue;
-                statistics[levels::DROPPED] += cell.insert(found, 0), statistics[levels::OPENED]++;
+                numbers[levels::DROPPED] += cell.insert(found, 0), numbers[levels::OPENED]++;
             }
             for (int64_t k = clusters[rank].begin; k < clusters[rank].end; k++) u.aside[b * M + own.sorted[k]] = 1;
         }
