@@ -395,7 +395,7 @@ def _cells(row: dict[str, Any], extra: bool) -> list[str]:
     """Return a row of the table."""
 
     def text(name: str, scale: float, digits: int) -> str:
-        return f"{scale * row[name]:.{digits}f}" if math.isfinite(row[name]) else "-"
+        return f"{scale * row[name]:.{digits}f}" if row[name] is not None and math.isfinite(row[name]) else "-"
 
     columns = [("right", 100, 2), ("unknown", 100, 1), ("ground_rmse", 100, 2), ("ceiling_rmse", 100, 2)]
     columns += [("missed", 100, 2), ("false", 100, 2)]
