@@ -317,6 +317,8 @@ class ElevationMap(RestartableMap):
             self._run_stages(map_layers(torch.zeros_like, self.state), inputs, weights)
         if self.channels is not None and is_readable(self.elevation):
             build_libraries()
+        if self.levels is not None:
+            self.levels.build()
 
     # Diagnosis ------------------------------------------------------------------------------------------------------
 

@@ -12,8 +12,10 @@ from torchelev.config import ElevationMapConfig
 from torchelev.kernels.cpu_build import AHEAD, build_ahead
 from torchelev.kernels.cpu_update import compiled_stages
 from torchelev.kernels.registry import PACKAGE
+from torchelev.levels.native import LIBRARY as LEVELS
 from torchelev.observations.image_kernel import LIBRARY as IMAGES
 from torchelev.observations.scan_kernel import LIBRARY as SCANS
+from torchelev.observations.voxel_kernel import LIBRARY as VOXELS
 from torchelev.pipeline import register_stages
 from torchelev.planning.dijkstra import LIBRARY as DIJKSTRA
 from torchelev.robot_body.own_kernel import LIBRARY as OWN_POINTS
@@ -30,7 +32,7 @@ def main() -> None:
     shutil.rmtree(AHEAD, ignore_errors=True)
     stages = compiled_stages(register_stages(ElevationMapConfig())).parts
     completion = library_of(CompletionNet.from_pretrained().weights)
-    others = (CASTING, CHANNELS, DIJKSTRA, ERRORS, HEIGHTS, IMAGES, OWN_POINTS, SCANS, VIEWS)
+    others = (CASTING, CHANNELS, DIJKSTRA, ERRORS, HEIGHTS, IMAGES, LEVELS, OWN_POINTS, SCANS, VIEWS, VOXELS)
     for library in (stages, completion, *others, library_parts()):
         for path in build_ahead(*library):
             print(path.name)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, cast
 import torch
 from torch import Tensor, nn
 
+from torchelev.kernels.cpu_build import load
 from torchelev.levels import native
 from torchelev.levels.state import (
     SURFACE,
@@ -57,6 +58,11 @@ class MapLevels(nn.Module):
         for name in LevelStatistics._fields:
             number = torch.zeros(num_envs, dtype=torch.int64, device=device)
             self.register_buffer(f"last_{name}", number, persistent=False)
+
+    def build(self) -> None:
+        """Build the C++ of these levels, if they run it."""
+        if self.corner.is_cpu:
+            load(*native.LIBRARY)
 
     @property
     def stored(self) -> Levels:
