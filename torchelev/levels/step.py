@@ -161,7 +161,7 @@ def _sort_points(
         shown = torch.where(known & ~above, scan.ground_floats, flies | (above & levels.is_open))
         if own.separation == "gap":
             shown = shown | known | (rank > 0)
-        opens = (there > 0) & ~to_ground & ~to_level & (shown | ramp)
+        opens = (there > 0) & ~to_ground & ~to_level & (shown | (ramp & ~known))
         chosen = torch.zeros_like(levels.support, dtype=torch.bool).scatter(1, nearest[:, None], to_level[:, None])
         stands = to_level & ~known & (found.lower < levels.lower.gather(1, nearest[:, None])[:, 0]) & ~flies
         levels = fuse(levels, chosen, found, cfg.fusion.max_support)

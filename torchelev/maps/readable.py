@@ -194,7 +194,9 @@ class ReadableMap(MapBuffers):
             require(actual == self.num_envs, "state", rule, actual, hint)
 
     def load_state(self, state: MapState) -> None:
-        """Copy a state into the buffers, such as one that `forward` returned; channels keep what fits its ground.
+        """Copy a state into the buffers, such as one that `forward` returned.
+
+        Channels keep what fits its ground, and levels their surfaces, which are no part of a state.
 
         Args:
             state: state of the same grid and number of environments; its values are converted to the map's dtype.

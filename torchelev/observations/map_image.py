@@ -47,7 +47,8 @@ class MapImage:
     - "validity", 1 where the elevation is known
     - "variance" [m^2]
     - "traversability", 0 (bad) to 1 (good)
-    - "clearance" [m] below the ceiling, at most `max_clearance`: maps whose config has a `LevelsConfig` know it
+    - "clearance" [m] below the ceiling, at most `max_clearance`, which open ground reads, and 0 where nobody looked:
+      maps whose config has a `LevelsConfig` know it
 
     After them come the components of `channels`, such as `MapImage(channels=("rgb", "terrain.stone"))`, each read in
     the cell that holds the pixel's centre.

@@ -64,7 +64,8 @@ class TraversalCostConfig:
         object.__setattr__(self, "class_costs", parse_costs(self.class_costs))
         for name in (each.name for each in fields(self) if each.name not in ("unknown_layer", "class_costs")):
             value = getattr(self, name)
-            if name == "height" and value is None:
+            if name == "height":
+                self._require_height(value)
                 continue
             in_range = isinstance(value, int | float) and 0 <= value < math.inf
             require(in_range, f"cost.{name}", "must be at least 0", repr(value), "leave it out for its default")
@@ -75,6 +76,12 @@ class TraversalCostConfig:
         require(self.max_forbidden < 1, "cost.max_forbidden", "must lie in [0, 1)", self.max_forbidden, "give 0.3")
         for name in ("inclination_distance", "unknown_class_cost"):
             require_positive(**{f"cost.{name}": getattr(self, name)})
+
+    def _require_height(self, value: object) -> None:
+        is_height = value is None or (isinstance(value, int | float) and not isinstance(value, bool))
+        require(is_height, "cost.height", "must be a number or None", repr(value), "give metres")
+        if value is not None:
+            require_positive(**{"cost.height": value})
 
 
 def traversal_cost(

@@ -379,7 +379,7 @@ struct Map {
             } else {
                 const bool above = known && found.lower > g;
                 bool shown = known && !above ? ground_floats : (above && is_open(p)) || floats(c, found.lower);
-                shown |= clusters[rank].above || (u.by_gap && (known || rank > 0));
+                shown |= (!known && clusters[rank].above) || (u.by_gap && (known || rank > 0));
                 if (!shown) continue;
                 numbers[levels::DROPPED] += cell.insert(found, 0), numbers[levels::OPENED]++;
             }
