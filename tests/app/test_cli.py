@@ -36,7 +36,7 @@ def options_by_group(text):
 def test_options_are_listed_by_group(run, command, others):
     groups = options_by_group(run(command, "--help")[1])
     assert groups["Recording"] == ["poses", "extrinsics", "depth-scale", "depth-axes", "colour"]
-    assert groups["Map"] == ["resolution", "size", "fixed", "device", "config"]
+    assert groups["Map"] == ["resolution", "size", "fixed", "levels", "device", "config"]
     assert {"intrinsics", "dt"} <= set(groups["Folders of files"])
     assert {"points", "tf"} <= set(groups["Bags"])
     assert set(others) <= set(groups["Output" if command == "map" else "Page"])

@@ -11,7 +11,7 @@ import torchelev
 from tests.docs.markdown import DOCS
 from torchelev.filters import FILTERS
 from torchelev.layers import LAYERS
-from torchelev.levels.views import LAYERS as LEVEL_LAYERS
+from torchelev.levels import LAYERS as LEVEL_LAYERS
 from torchelev.stages.complete import COMPLETED
 
 REFERENCE = DOCS / "reference"

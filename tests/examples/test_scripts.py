@@ -108,6 +108,7 @@ CHECKS = {
     "own_head": check_own_head,
     "plan_around_water": check_around_water,
     "planning": check_planning,
+    "under_a_table": lambda out: "0.5 m fits" in out and "0.9 m does not fit" in out,
     "world_map": check_world_map,
     "robot_50hz": lambda out: 0 < numbers(out)[0] <= 51 and "p99" in out,
 }

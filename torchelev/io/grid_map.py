@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchelev.errors import require
-from torchelev.levels.views import LAYERS as LEVEL_LAYERS
+from torchelev.levels import LAYERS as LEVEL_LAYERS
 
 if TYPE_CHECKING:
     from torchelev.elevation_map import ElevationMap

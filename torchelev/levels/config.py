@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from torchelev.errors import require, require_positive
-from torchelev.grid import GridConfig
+
+if TYPE_CHECKING:
+    from torchelev.grid import GridConfig
 
 MAX_LEVELS = 8  # a cell of more is a bush
 SEPARATIONS = ("rays", "gap")

@@ -41,10 +41,10 @@ SAME = 0.1  # [m] by which points may miss the ground and still show that it is 
 class Step(NamedTuple):
     """The result of an update of levels."""
 
-    levels: Levels
+    levels: Levels  #: after it
     state: MapState  #: of the map: recentred, and with the ground that was chosen
     aside: Bool[Tensor, "B M"]  #: points that do not measure the ground
-    statistics: LevelStatistics
+    statistics: LevelStatistics  #: what it did
 
 
 class _Scan(NamedTuple):

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
     from torchelev.config import ElevationMapConfig
 
-LAYERS = ("ceiling", "clearance")  # that a map with levels has besides
 BY_LEVEL = ("elevation", "underside", "variance", "time", "validity")  # layers of each surface
 
 

@@ -12,6 +12,7 @@ from torchelev.config import ElevationMapConfig
 from torchelev.errors import require
 from torchelev.inputs import checks
 from torchelev.layers import LAYERS, MODES, Layer, sample_layer, sample_lowest
+from torchelev.levels import LAYERS as LEVEL_LAYERS
 from torchelev.levels import views
 from torchelev.levels.module import MapLevels
 from torchelev.maps.buffers import MapBuffers
@@ -113,7 +114,7 @@ class ReadableMap(MapBuffers):
     @property
     def _own_layers(self) -> tuple[str, ...]:
         channels = () if self.channels is None else self.channels.layers
-        levels = () if self.levels is None else views.LAYERS
+        levels = () if self.levels is None else LEVEL_LAYERS
         return (*LAYERS, *(() if self.completion_net is None else COMPLETED), *levels, *channels)
 
     def layer(self, name: str, *, state: MapState | None = None, level: int | None = None) -> Float[Tensor, "B H W"]:
@@ -234,7 +235,7 @@ class ReadableMap(MapBuffers):
         require(name in self._own_layers, "layer", "must be a layer's name", repr(name), hint, KeyError)
         if name in COMPLETED:
             return self._complete(state)[name]
-        if name in views.LAYERS:
+        if name in LEVEL_LAYERS:
             assert self.cfg.levels is not None
             return getattr(views, name)(self._surfaces(state), self.cfg.levels.min_gap)  # type: ignore[no-any-return]
         if name not in LAYERS:
@@ -247,7 +248,7 @@ class ReadableMap(MapBuffers):
         """Return what to do about a layer that is not there."""
         if name in COMPLETED:
             return "give the config a CompletionConfig"
-        if name in views.LAYERS:
+        if name in LEVEL_LAYERS:
             return "give the config levels=LevelsConfig(max_levels=3)"
         return f"there are {', '.join(self.layers)}"
 
@@ -313,5 +314,5 @@ class ReadableMap(MapBuffers):
         require(mode in MODES, "mode", f"must be one of {', '.join(MODES)}", repr(mode), "use bilinear")
         corner = (self.state if state is None else state).corner
         uv = (xy.double() / self.cfg.grid.resolution - corner[:, None]).to(self.elevation.dtype)
-        sample = sample_lowest if layer in views.LAYERS else sample_layer
+        sample = sample_lowest if layer in LEVEL_LAYERS else sample_layer
         return sample(self.read_layer(layer, state), uv, self.cfg.grid, mode)

@@ -13,7 +13,6 @@ from torchelev.app.interrupts import defer_interrupts
 from torchelev.app.mapping.map_channels import add_channels
 from torchelev.channels.config import ChannelConfig
 from torchelev.io import Frame, MappingRun
-from torchelev.levels.config import LevelsConfig
 
 if TYPE_CHECKING:
     from torchelev.config import ElevationMapConfig
@@ -42,6 +41,7 @@ def new_map(config: ElevationMapConfig, device: str, options: MapOptions) -> Ele
     import torch
 
     from torchelev.elevation_map import ElevationMap
+    from torchelev.levels.config import LevelsConfig
 
     if config.sensor.links:
         raise ValueError("config.sensor.body: recordings hold no poses of links; give one box, lower and upper")

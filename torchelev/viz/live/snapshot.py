@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torchelev.errors import require
 from torchelev.io.export import SavedMap, take
 from torchelev.layers import LAYERS
-from torchelev.levels.views import LAYERS as LEVEL_LAYERS
+from torchelev.levels import LAYERS as LEVEL_LAYERS
 
 if TYPE_CHECKING:
     from jaxtyping import Float
