@@ -45,9 +45,7 @@ def test_layers_of_one_environment_are_its_own(emap, tmp_path):
     assert np.nanmax(load_npz(tmp_path / "map.npz").layers["rgb.green"]) == 1.0
     assert load_map(tmp_path / "map.npz").layer("number").nan_to_num().max() == 2.0
     state = type(emap.state)(*(value[:1] for value in emap.state[:-1]), statistics=emap.state.statistics)
-    with pytest.raises(
-        ValueError, match="state: must be of all 3 maps, as channels and levels"
-    ):
+    with pytest.raises(ValueError, match="state: must be of all 3 maps, as channels and levels"):
         emap.layer("number", state=state)
 
 
