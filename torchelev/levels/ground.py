@@ -10,6 +10,7 @@ from torch import Tensor
 from torchelev.grid import GridConfig
 from torchelev.levels.config import LevelsConfig
 from torchelev.levels.surfaces import SETTLED
+from torchelev.ops.windows import AROUND, neighbours
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -65,15 +66,6 @@ class _Wave(NamedTuple):
     reached: Bool[Tensor, "B K+1 H W"]
     height: Float[Tensor, "B K+1 H W"]
     blind: Int[Tensor, "B K+1 H W"]  # cells since the last surface
-
-
-def _beside(value: Tensor, axis: int, step: int, blank: float) -> Tensor:
-    """Return each cell's neighbour along an axis; beyond the window it is blank."""
-    rim = torch.full_like(value.narrow(axis, 0, 1), blank)
-    size = value.shape[axis]
-    if step > 0:
-        return torch.cat([value.narrow(axis, 1, size - 1), rim], axis)
-    return torch.cat([rim, value.narrow(axis, 0, size - 1)], axis)
 
 
 def choose_ground(
@@ -139,11 +131,10 @@ def _step(
     reached = torch.zeros_like(known)
     guess = torch.full_like(heights[:, 0], torch.inf)
     count = torch.zeros_like(guess, dtype=torch.int64)
-    for axis, step in ((1, 1), (1, -1), (2, 1), (2, -1)):
-        for k in range(wave.reached.shape[1]):
-            comes = _beside(wave.reached[:, k].to(heights.dtype), axis, step, 0.0) > 0
-            height = _beside(wave.height[:, k], axis, step, 0.0)
-            blind = _beside(wave.blind[:, k], axis, step, 0)
+    around = zip(*(neighbours(value, 0) for value in (wave.reached.to(heights.dtype), *wave[1:])), strict=True)
+    for side in (pair for (i, j), pair in zip(AROUND, around, strict=True) if i == 0 or j == 0):
+        for k, (is_reached, height, blind) in enumerate(zip(*(value.unbind(1) for value in side), strict=True)):
+            comes = is_reached > 0
             limit = cfg.max_step + (SLOPE * grid.resolution) * blind.to(heights.dtype)
             near = (comes & ((heights.movedim(1, 0) - height).abs() <= limit)).movedim(0, 1)
             if k == len(heights[0]):  # what is guessed leads to the ground alone

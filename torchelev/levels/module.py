@@ -90,11 +90,9 @@ class MapLevels(nn.Module):
             recenter(state, inputs)
             aside, statistics = native.update_in_cpp(self.stored, self.corner, state, inputs, self.cfg)
         else:
-            before = self._of_maps(state)
-            corner = state.corner.clone()
             m = measure(*inputs, self.cfg.grid, self.cfg.sensor, state.elevation.dtype)
             recenter(state, inputs)
-            step = update_levels(before, state.corner - corner, state, m, self.cfg)
+            step = update_levels(self._of_maps(state), state, m, self.cfg)
             map_layers(lambda old, new: old if new is old else old.copy_(new), state, step.state)
             self._write(step.levels, state.corner)
             aside, statistics = step.aside.view(inputs.points.shape[:3]), step.statistics

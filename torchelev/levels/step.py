@@ -22,7 +22,7 @@ from torchelev.levels.rays import (
     nearest_around,
     ray_heights,
 )
-from torchelev.levels.state import Levels, LevelStatistics, age, forget_space, move, remove
+from torchelev.levels.state import Levels, LevelStatistics, age, forget_space, remove
 from torchelev.levels.surfaces import GATE, SETTLED, Found, distance, fuse, insert, merge
 from torchelev.ops.masks import count
 from torchelev.ops.transforms import is_readable
@@ -59,22 +59,18 @@ class _Scan(NamedTuple):
     y: Float[Tensor, "B cells"]
 
 
-def update_levels(
-    levels: Levels, shift: Int[Tensor, "B 2"], state: MapState, m: Measurement, cfg: ElevationMapConfig
-) -> Step:
+def update_levels(levels: Levels, state: MapState, m: Measurement, cfg: ElevationMapConfig) -> Step:
     """Sort the points of a scan into the ground and other surfaces, and choose which surface is the ground.
 
     Args:
-        levels: of the maps, before their windows moved.
-        shift: cells by which they moved.
+        levels: in the windows of the state.
         state: of the maps, recentred for this update.
         m: the measurement.
         cfg: of the maps, with levels.
     """
     assert cfg.levels is not None
     grid, own = cfg.grid, cfg.levels
-    size, largest = (grid.height, grid.width), max(grid.height, grid.width)
-    levels = move(levels, shift.clamp(-largest, largest))
+    size = (grid.height, grid.width)
     levels = age(levels, m.dt, cfg.aging.variance_rate, cfg.fusion.max_variance)
     slot, inside = _slots(state, m, cfg)
     scan = _look_at(state, m, slot, inside, cfg)

@@ -1,7 +1,5 @@
 // What an update does to levels: step.py, for float32 maps on a CPU.
 
-#include <numeric>
-
 #include "kernels/threads.h"
 #include "levels/kernel/ground.h"
 #include "levels/kernel/rays.h"
@@ -237,9 +235,10 @@ struct Map {
 
     // Sorting points into surfaces -------------------------------------------------------------------------------
 
+    // Whether rays passed below a surface at height `top` over a cell: it hangs free.
     bool floats(int64_t c, float top) const {
         if (!(own.lowest[c] < top - levels::HEIGHTS[0] * u.min_gap)) return false;  // mostly
-        return sights.floats(own.x[c / u.W], own.y[c % u.W], top, own.lowest[c]);
+        return sights.are_free_below(own.x[c / u.W], own.y[c % u.W], top);
     }
 
     bool has_levels(int64_t p) const {

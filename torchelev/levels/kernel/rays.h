@@ -108,9 +108,8 @@ struct Sights {
     std::vector<Sight>& of;
     float min_gap;
 
-    // Whether rays passed below a surface at height `top` over a cell, where `lowest` is the lowest ray [m].
-    bool floats(float x, float y, float top, float lowest) const {
-        if (!(lowest < top - HEIGHTS[0] * min_gap)) return false;
+    // Whether a place below a surface at height `top` over a cell is free.
+    bool are_free_below(float x, float y, float top) const {
         for (const Sight& sight : of)
             for (const float part : HEIGHTS)
                 if (sight.is_free(x, y, top - part * min_gap, size)) return true;

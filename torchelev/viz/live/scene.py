@@ -48,9 +48,9 @@ class Scene:
         before, self._drawn = self._drawn, {}
         self._draw_surface(snapshot, colors)
         if BOUND in parts:
-            self._draw_bound(snapshot)
+            self._draw_ghost(BOUND, *bound_sheet(snapshot.map, self.origin), opacity=0.3)
         if CEILING in parts:
-            self._draw_ceiling(snapshot)
+            self._draw_ghost(CEILING, *ceiling_sheet(snapshot.map, self.origin), opacity=0.25)
         if FRAMES in parts:
             self._draw_frames(snapshot)
         for name, points, size in ((CLOUD, snapshot.cloud, 0.015), (SCAN, snapshot.scan, 0.03)):
@@ -78,17 +78,11 @@ class Scene:
         if mesh:
             self._keep("map", self._scene.add_glb, mesh, cast_shadow=False, receive_shadow=False)
 
-    def _draw_bound(self, snapshot: Snapshot) -> None:
-        vertices, triangles = bound_sheet(snapshot.map, self.origin)
+    def _draw_ghost(self, name: str, vertices: NDArray, triangles: NDArray, opacity: float) -> None:
+        """Draw a sheet that one can see through, unless it is empty."""
         if len(triangles):
-            ghost = {"color": _COLORS[BOUND], "opacity": 0.3, "side": "double", "cast_shadow": False}
-            self._keep(BOUND, self._scene.add_mesh_simple, vertices, triangles, **ghost)
-
-    def _draw_ceiling(self, snapshot: Snapshot) -> None:
-        vertices, triangles = ceiling_sheet(snapshot.map, self.origin)
-        if len(triangles):
-            ghost = {"color": _COLORS[CEILING], "opacity": 0.25, "side": "double", "cast_shadow": False}
-            self._keep(CEILING, self._scene.add_mesh_simple, vertices, triangles, **ghost)
+            ghost = {"color": _COLORS[name], "opacity": opacity, "side": "double", "cast_shadow": False}
+            self._keep(name, self._scene.add_mesh_simple, vertices, triangles, **ghost)
 
     def _draw_frames(self, snapshot: Snapshot) -> None:
         if snapshot.T_map_base is not None:
