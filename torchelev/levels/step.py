@@ -47,6 +47,18 @@ class Step(NamedTuple):
     statistics: LevelStatistics  #: what it did
 
 
+class _Sorted(NamedTuple):
+    """Points that were sorted into the ground and other surfaces."""
+
+    levels: Levels
+    state: MapState
+    aside: Bool[Tensor, "B M"]  # points that do not measure the ground
+    waiting: Float[Tensor, "B cells"]  # points that will found the ground where that is not known
+    height: Float[Tensor, "B cells"]  # [m] of these
+    opened: Int[Tensor, "B"]
+    dropped: Int[Tensor, "B"]
+
+
 class _Scan(NamedTuple):
     """A scan over the window."""
 
@@ -76,23 +88,24 @@ def update_levels(levels: Levels, state: MapState, m: Measurement, cfg: Elevatio
     scan = _look_at(state, m, slot, inside, cfg)
     levels = Levels(*(part.flatten(-2) for part in levels))
     state = state._replace(**{name: getattr(state, name).flatten(1) for name in GROUND})
-    levels, state, aside, opened, dropped = _sort_points(levels, state, scan, cfg)
-    levels, met = merge(levels)
+    points = _sort_points(levels, state, scan, cfg)
+    (levels, met), state = merge(points.levels), points.state
     away = distance(levels.lower, levels.upper, state.elevation[:, None], state.elevation[:, None])
     met = met | ((levels.support > 0) & state.validity[:, None] & (away < 0.5 * own.min_gap))
     levels = remove(levels, met)
     cleared = _seen_through(levels, scan, cfg)
     levels = remove(levels, cleared)
     highest, lowest = scan.rays
-    opens = state.validity & (lowest < state.elevation + 0.5 * own.min_gap) & (highest >= state.elevation + own.min_gap)
+    is_firm = state.validity & (state.support >= own.least_support)
+    opens = is_firm & (lowest < state.elevation + 0.5 * own.min_gap) & (highest >= state.elevation + own.min_gap)
     levels = levels._replace(free_top=torch.maximum(levels.free_top, highest), is_open=levels.is_open | opens)
-    levels, state, changed = _choose(levels, state, m, scan, cfg)
-    aside = inside & (aside | changed.gather(1, slot))
+    levels, state, changed = _choose(points._replace(levels=levels), m, scan, cfg)
+    aside = inside & (points.aside | changed.gather(1, slot))
     return Step(
         Levels(*(part.unflatten(-1, size) for part in levels)),
         state._replace(**{name: getattr(state, name).unflatten(1, size) for name in GROUND}),
         aside,
-        LevelStatistics(opened, count(cleared), count(met), dropped, count(changed)),
+        LevelStatistics(points.opened, count(cleared), count(met), points.dropped, count(changed)),
     )
 
 
@@ -124,14 +137,8 @@ def _look_at(state: MapState, m: Measurement, slot: Tensor, inside: Tensor, cfg:
     return _Scan(clusters, floating, ground_floats & state.validity.flatten(1), sights, rays, x, y)
 
 
-def _sort_points(
-    levels: Levels, state: MapState, scan: _Scan, cfg: ElevationMapConfig
-) -> tuple[Levels, MapState, Bool[Tensor, "B M"], Int[Tensor, "B"], Int[Tensor, "B"]]:
-    """Sort clusters into the ground, surfaces that are there, and new ones.
-
-    Returns:
-        The levels, the state, the points that are set aside, and how many surfaces were opened and dropped.
-    """
+def _sort_points(levels: Levels, state: MapState, scan: _Scan, cfg: ElevationMapConfig) -> _Sorted:
+    """Sort clusters into the ground, surfaces that are there, and new ones."""
     own, clusters, num_cells = cfg.levels, scan.clusters, cfg.grid.num_cells
     assert own is not None
     demoted = state.validity & scan.ground_floats & _shows_ground(clusters, state.elevation, own, num_cells)
@@ -139,6 +146,7 @@ def _sort_points(
     levels = levels._replace(is_open=levels.is_open & ~demoted)
     state, dropped, opened = _forget_ground(state, demoted), count(lost), count(demoted)
     aside_of = torch.zeros_like(clusters.slot, dtype=torch.bool)
+    waiting, height = torch.zeros_like(state.elevation), state.elevation
     for rank in range(2 * own.max_levels):
         there = in_cells(clusters.number, clusters, rank, num_cells, 0.0)
         found = _found_of(clusters, rank, cfg)
@@ -162,11 +170,13 @@ def _sort_points(
         stands = to_level & ~known & (found.lower < levels.lower.gather(1, nearest[:, None])[:, 0]) & ~flies
         levels = fuse(levels, chosen, found, cfg.fusion.max_support)
         levels, state = found_ground(levels, state, torch.where(stands, nearest, NONE))
+        waits = (there > 0) & ~to_level & ~opens & ~known & (waiting == 0)
+        waiting, height = torch.where(waits, there, waiting), torch.where(waits, found.mean, height)
         levels, lost = insert(levels, opens, found, 0.0)
         dropped, opened = dropped + count(lost), opened + count(opens)
         other = torch.nn.functional.pad(to_level | opens, (0, 1))
         aside_of = aside_of | ((clusters.rank == rank) & other.gather(1, clusters.slot))
-    return levels, state, aside_of.gather(1, clusters.of_point), opened, dropped
+    return _Sorted(levels, state, aside_of.gather(1, clusters.of_point), waiting, height, opened, dropped)
 
 
 def _shows_ground(clusters: Clusters, g: Tensor, own: LevelsConfig, num_cells: int) -> Bool[Tensor, "B cells"]:
@@ -237,25 +247,31 @@ def _seen_through(levels: Levels, scan: _Scan, cfg: ElevationMapConfig) -> Bool[
 
 
 def _choose(
-    levels: Levels, state: MapState, m: Measurement, scan: _Scan, cfg: ElevationMapConfig
+    points: _Sorted, m: Measurement, scan: _Scan, cfg: ElevationMapConfig
 ) -> tuple[Levels, MapState, Bool[Tensor, "B cells"]]:
     """Make the surface that the robot reaches first the ground, and return where it changed.
 
-    Where the ground was hit last, surfaces of fewer points do not count, unless they are SETTLED.
+    Surfaces above the ground, and all where it was hit last, do not count if they have fewer points and are not SETTLED.
+    Beside levels, the points that will found the ground where it is not known stand for it.
 
     Near the robot, ground of another floor that it cannot reach becomes a level too (paper, Sec. II-F, without the
     forgetting).
     """
     own, size = cfg.levels, (cfg.grid.height, cfg.grid.width)
     assert own is not None
+    levels, state = points.levels, points.state
     if m.base is None:
         return levels, state, torch.zeros_like(state.validity)
-    heights = torch.cat([state.elevation[:, None], levels.upper], 1).unflatten(2, size)
-    has_rival = state.validity[:, None] & (state.time[:, None] <= levels.time)
-    rival = torch.where(has_rival, state.support.clamp(max=SETTLED)[:, None], 0.0).clamp(min=own.least_support)
-    known = torch.cat([state.validity[:, None], levels.support >= rival], 1).unflatten(2, size)
+    waits = (points.waiting > 0) & (levels.support > 0).any(1)
+    ground = torch.where(waits, points.height, state.elevation)[:, None]
+    heights = torch.cat([ground, levels.upper], 1).unflatten(2, size)
+    is_dust = (state.time[:, None] <= levels.time) | (levels.lower > ground) | waits[:, None]
+    rival = torch.where(waits, points.waiting, torch.where(state.validity, state.support, 0.0)).clamp(max=SETTLED)
+    rival = torch.where(is_dust, rival[:, None], 0.0).clamp(min=own.least_support)
+    known = torch.cat([(state.validity | waits)[:, None], levels.support >= rival], 1).unflatten(2, size)
     square = (scan.x - m.base[:, 0, None]).square() + (scan.y - m.base[:, 1, None]).square()
-    support = torch.cat([state.support[:, None], levels.support], 1).unflatten(2, size)
+    of_ground = torch.where(waits, 0.0, state.support)[:, None]
+    support = torch.cat([of_ground, levels.support], 1).unflatten(2, size)
     standing = find_standing(heights, known, support, m.base, square.unflatten(1, size))
     first, reached = choose_ground(heights, known, standing, cfg.grid, own, is_readable(state.elevation))
     levels, state, changed = swap(levels, state, first.flatten(1), cfg)

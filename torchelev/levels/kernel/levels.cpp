@@ -12,6 +12,11 @@ using levels::Cell, levels::Found, levels::INFINITE, levels::Points, levels::Upd
 constexpr int64_t BLOCK = 64, FEW = 32;  // points that are measured at a time; points that insertion sorts fastest
 constexpr float SAME = 0.1f;
 
+// What a scan will found the ground of a cell with, where that is not known.
+struct Waiting {
+    float height, number;  // [m], of points; 0: nothing
+};
+
 // Memory of a thread, kept between updates.
 struct Scratch {
     Points points;
@@ -22,6 +27,7 @@ struct Scratch {
     std::vector<uint8_t> all_above, changed;   // (H W)
     std::vector<uint8_t> simple;               // of `touched`
     std::vector<int32_t> touched, complex, first, sorted;
+    std::vector<Waiting> waiting;              // of `complex`
     std::vector<int32_t> there;                // level * cells + cell, of the search
     levels::Search search;
 };
@@ -269,6 +275,7 @@ struct Map {
             own.list[c] = int32_t(own.complex.size()), own.complex.push_back(c);
             own.first.push_back(own.first.back() + own.number[c]);
         }
+        own.waiting.assign(own.complex.size(), {0, 0});
         if (own.complex.empty()) return;
         own.sorted.resize(own.first.back());
         std::vector<int32_t> next(own.first.begin(), own.first.end() - 1);
@@ -279,7 +286,8 @@ struct Map {
         std::atomic<int64_t> opened{0}, dropped{0};
         parts(int64_t(own.complex.size()), [&](int64_t, int64_t begin, int64_t end) {
             int64_t of_part[levels::STATISTICS] = {};
-            for (int64_t k = begin; k < end; k++) sort_cell(own.complex[k], own.first[k], own.first[k + 1], of_part);
+            for (int64_t k = begin; k < end; k++)
+                sort_cell(own.complex[k], own.first[k], own.first[k + 1], own.waiting[k], of_part);
             opened += of_part[levels::OPENED], dropped += of_part[levels::DROPPED];
         });
         statistics[levels::OPENED] += opened, statistics[levels::DROPPED] += dropped;
@@ -346,7 +354,7 @@ struct Map {
     void forget_ground(int64_t c) const { u.validity[b * cells + c] = 0, u.challenger_support[b * cells + c] = 0; }
 
     // Sort the points of a cell, by their places in `sorted`: `_sort_points`.
-    void sort_cell(int64_t c, int64_t begin, int64_t end, int64_t* numbers) {
+    void sort_cell(int64_t c, int64_t begin, int64_t end, Waiting& waiting, int64_t* numbers) {
         static thread_local std::vector<Cluster> clusters;
         find_clusters(begin, end, clusters);
         const int64_t p = place(c);
@@ -379,7 +387,10 @@ struct Map {
                 const bool above = known && found.lower > g;
                 bool shown = known && !above ? ground_floats : (above && is_open(p)) || floats(c, found.lower);
                 shown |= (!known && clusters[rank].above) || (u.by_gap && (known || rank > 0));
-                if (!shown) continue;
+                if (!shown) {
+                    if (!known && !(waiting.number > 0)) waiting = {found.mean, found.number};
+                    continue;
+                }
                 numbers[levels::DROPPED] += cell.insert(found, 0), numbers[levels::OPENED]++;
             }
             for (int64_t k = clusters[rank].begin; k < clusters[rank].end; k++) u.aside[b * M + own.sorted[k]] = 1;
@@ -405,8 +416,9 @@ struct Map {
         float* __restrict top = &free_top(p);
         uint8_t* __restrict open = &is_open(p);
         for (int64_t n = 0; n < number; n++) top[n] = std::max(top[n], high[n]);
+        const float *of_ground = u.ground_support + b * cells + first, least = std::max(u.min_support, 0.5f);
         for (int64_t n = 0; n < number; n++)
-            open[n] |= known[n] & uint8_t((low[n] < g[n] + 0.5f * gap) & (high[n] >= g[n] + gap));
+            open[n] |= known[n] & uint8_t((of_ground[n] >= least) & (low[n] < g[n] + 0.5f * gap) & (high[n] >= g[n] + gap));
         float most = 0;  // mostly 0: no cell of the stretch has levels
         for (int64_t l = 0; l < u.L; l++) {
             const float* support = u.support + (b * u.L + l) * cells + p;
@@ -451,6 +463,17 @@ struct Map {
         return u.overlap_radius > 0 && highest - lowest > u.overlap_height;
     }
 
+    // Whether points of this scan will found the ground of a cell that has levels.
+    bool waits(int64_t c) const { return own.list[c] >= 0 && own.waiting[own.list[c]].number > 0 && has_levels(place(c)); }
+
+    // How many points a surface needs to come before the ground of a cell.
+    float rival_of(int64_t c, float lower, float time) const {
+        if (waits(c)) return std::min(own.waiting[own.list[c]].number, levels::SETTLED);
+        const int64_t n = b * cells + c;
+        const bool is_dust = u.ground_time[n] <= time || lower > u.elevation[n];
+        return u.validity[n] && is_dust ? std::min(u.ground_support[n], levels::SETTLED) : 0;
+    }
+
     void choose() {
         if (!has_choice()) return;
         levels::Search& search = own.search;
@@ -464,14 +487,15 @@ struct Map {
             uint16_t* firm = &search.firm[search.at(i, 0)];
             for (int64_t j = 0; j < u.W; j++) to[j] = u.validity[n + j] ? u.elevation[n + j] : NAN;
             for (int64_t j = 0; j < u.W; j++) firm[j] = u.ground_support[n + j] >= levels::SETTLED;
+            for (int64_t j = 0; j < u.W; j++)
+                if (waits(i * u.W + j)) to[j] = own.waiting[own.list[i * u.W + j]].height, firm[j] = 0;
             for (int64_t l = 0; l < u.L; l++) {
                 const int64_t q = (b * u.L + l) * cells + row[i];
                 to += search.cells;
                 for (int64_t j = 0; j < u.W; j++) {
-                    const bool has_rival = u.validity[n + j] && u.ground_time[n + j] <= u.time[q + column[j]];
-                    const float rival = has_rival ? std::min(u.ground_support[n + j], levels::SETTLED) : 0;
-                    const bool is_there = u.support[q + column[j]] >= std::max(least, rival);
-                    if (!is_there) continue;
+                    if (!(u.support[q + column[j]] >= least)) continue;
+                    const float rival = rival_of(i * u.W + j, u.lower[q + column[j]], u.time[q + column[j]]);
+                    if (!(u.support[q + column[j]] >= rival)) continue;
                     to[j] = u.upper[q + column[j]], own.there.push_back(int32_t((l + 1) * search.cells + search.at(i, j)));
                     firm[j] |= uint16_t((u.support[q + column[j]] >= levels::SETTLED) << (l + 1));
                 }

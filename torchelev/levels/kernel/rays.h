@@ -78,7 +78,7 @@ struct Sight {
         const float* row = nearest.data() + size.elevation_bin(d, z - origin[2]) * A;
         const int half = std::min(int(std::ceil(size.window / std::max(d, size.resolution))), MAX_WINDOW);
         float found = INFINITE;
-        for (int k = -half; k <= half; k++) found = std::min(found, row[(azimuth + k + A) % A]);
+        for (int32_t k = azimuth - half; k <= azimuth + half; k++) found = std::min(found, row[k < 0 ? k + A : k >= A ? k - A : k]);
         return found;
     }
 
