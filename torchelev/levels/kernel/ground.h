@@ -8,10 +8,13 @@
 #include <utility>
 #include <vector>
 
+#include "levels/kernel/surfaces.h"
+
 namespace levels {
 
 constexpr float SLOPE = 0.5f, NEAR = 1.0f;
 constexpr int8_t NONE = -1, UNDECIDED = -2;
+constexpr int MOST = 8;  // surfaces of a cell: MAX_LEVELS of config.py
 
 struct Standing {
     int64_t cell = 0;
@@ -20,36 +23,44 @@ struct Standing {
     bool found = false;
 };
 
+// A cell with levels.
+struct Several {
+    int64_t cell;
+    float height[MOST];     // [m] of the surfaces, 0 the ground; NaN: not there, or of too few points
+    uint16_t firm = 0;      // surfaces of many points, a bit each
+    uint16_t entered = 0;   // levels that a way from the ground may lead to, a bit each
+    int8_t first = UNDECIDED;
+    int32_t decided_in = 0;  // the step in which it was reached first
+};
+
 // The search over the surfaces of a window, whose rim of cells without any spares the questions for its border. Its
 // memory is kept between updates.
 struct Search {
-    std::vector<float> height;        // (K, cells) [m] NaN: no surface
-    std::vector<float> guess;         // (cells) [m]
-    std::vector<int32_t> blind;       // (cells) cells since the last surface
-    std::vector<int32_t> decided_in;  // (cells) the step in which a cell of several surfaces was reached first
-    std::vector<uint16_t> firm;       // (cells) surfaces of many points, a bit each
-    std::vector<uint16_t> open;       // (cells) surfaces that were not reached, a bit each, and flags
-    std::vector<int8_t> first;        // (cells)
-    std::vector<int32_t> wave, next;  // nodes: surface << SHIFT | cell
-
+    std::vector<float> height;   // (cells) [m] of the ground, or where it is guessed to be; NaN: neither
+    std::vector<int32_t> entry;  // (cells) place in `several`, -1 for none
+    std::vector<Several> several;
+    const float* support;        // (H W) of the ground
     int64_t H, W, pitch, cells;
     int K;
     float max_step, rise;
     int32_t max_blind;
-    int32_t step = 0;
-    static constexpr int SHIFT = 27;
-    // Bits of `open`: the guess was not reached; it came in this step; the cell may be reached on several surfaces.
-    static constexpr uint16_t GUESS = 1 << 13, FRESH = 1 << 14, SEVERAL = 1 << 15;
 
+    // Begin with a window; `height` within the rim is the caller's to set, and `several` to add to.
     void start(int64_t rows, int64_t columns, int surfaces) {
         H = rows, W = columns, pitch = W + 2, cells = (H + 2) * pitch, K = surfaces;
-        height.assign(K * cells, NAN), guess.resize(cells), blind.resize(cells), open.resize(cells), firm.resize(cells);
-        decided_in.resize(cells), first.assign(cells, UNDECIDED);
-        if (next.size() <= size_t(K + 1) * cells) wave.resize((K + 1) * cells + 1), next.resize((K + 1) * cells + 1);
+        height.resize(cells), entry.assign(cells, -1), several.clear();
+        std::fill_n(height.begin(), pitch, NAN), std::fill_n(height.end() - pitch, pitch, NAN);
+        for (int64_t i = 0; i < H; i++) height[at(i, -1)] = height[at(i, W)] = NAN;
     }
 
     // The cell of a row and a column of the window.
     int64_t at(int64_t i, int64_t j) const { return (i + 1) * pitch + j + 1; }
+
+    Several& add(int64_t c) {
+        entry[c] = int32_t(several.size());
+        several.emplace_back().cell = c;
+        return several.back();
+    }
 
     // Find the highest surface below the base in the cell nearest to it that has one, or in the nearest within NEAR
     // where that has many points.
@@ -64,28 +75,45 @@ struct Search {
         return weak.found && square <= NEAR * NEAR ? weak : search(base, x, y, 0, H - 1, 0, W - 1, false, square);
     }
 
-    // Whether one of these levels (nodes) lies beside ground that is within a step of it: else none can be reached.
-    bool touches_ground(const std::vector<int32_t>& nodes) const {
-        for (const int32_t node : nodes) {
-            const int64_t c = node % cells;
-            for (const int64_t beside : {c - pitch, c + pitch, c - 1, c + 1})
-                if (std::fabs(height[beside] - height[node]) <= max_step) return true;
+    // Mark the levels that a way from the robot may lead to: those a step from ground, and from each other. Return
+    // whether one may be reached before the ground of its cell: a level that is entered only from where that ground is
+    // entered too never is.
+    bool enter(const Standing& standing) {
+        bool may_be_first = standing.surface > 0;
+        nodes.clear();
+        if (standing.surface > 0) mark(several[entry[standing.cell]], standing.surface);
+        for (Several& own : several)
+            for (int k = 1; k < K; k++)
+                if (touches_ground(own, k)) mark(own, k);
+        while (!nodes.empty()) {
+            const Several& own = several[nodes.back().first];
+            const int k = nodes.back().second;
+            nodes.pop_back();
+            for (const int64_t away : {-pitch, pitch, int64_t(-1), int64_t(1)}) {
+                const int64_t c = own.cell + away;
+                may_be_first |= leads_up(own, k, height[c]);
+                if (entry[c] < 0) continue;
+                Several& other = several[entry[c]];
+                for (int m = 1; m < K; m++)
+                    if (std::fabs(other.height[m] - own.height[k]) <= max_step)
+                        mark(other, m), may_be_first |= leads_up(other, m, own.height[k]);
+            }
         }
-        return false;
+        return may_be_first;
     }
 
-    // Search until the cells of several surfaces are reached; `is_whole`: until all are.
+    // Search until the cells whose levels were entered are reached; `is_whole`: until all are.
     void run(const Standing& standing, bool is_whole) {
-        std::fill(open.begin(), open.end(), uint16_t(0));
-        int64_t several = 0;
+        open.assign(cells, 0), blind.resize(cells);
+        if (next.size() <= size_t(K + 1) * cells) wave.resize((K + 1) * cells + 1), next.resize((K + 1) * cells + 1);
         for (int64_t i = 0; i < H; i++)
-            for (int64_t c = at(i, 0); c < at(i, W); c++) {
-                uint16_t bits = 0;
-                for (int k = 0; k < K; k++) bits |= uint16_t(height[k * cells + c] == height[k * cells + c]) << k;
-                open[c] = uint16_t(bits | (bits & 1 ? 0 : GUESS) | (bits > 1 ? SEVERAL : 0));
-                several += bits > 1;
-            }
-        step = 0, number = 0, undecided = several, fresh.clear();
+            for (int64_t c = at(i, 0); c < at(i, W); c++) open[c] = height[c] == height[c] ? 1 | KNOWN : GUESS;
+        undecided = 0;
+        for (const Several& own : several) {
+            for (int k = 1; k < K; k++) open[own.cell] |= uint16_t(own.height[k] == own.height[k]) << k;
+            if (own.entered) open[own.cell] |= ENTERED, undecided++;
+        }
+        step = 0, number = 0, fresh.clear();
         if (standing.found) reach(standing.surface, standing.cell);
         for (step = 1; step <= H + W && number && (undecided || is_whole); step++) {
             wave.swap(next);
@@ -95,18 +123,37 @@ struct Search {
         }
     }
 
-    bool is_reached(int64_t c) const { return !(open[c] & 1) && height[c] == height[c]; }
+    bool is_reached(int64_t c) const { return (open[c] & (1 | KNOWN)) == KNOWN; }
 
   private:
-    int64_t number = 0;          // of nodes in `next`
-    int64_t undecided = 0;       // cells of several surfaces that were not reached
-    std::vector<int32_t> fresh;  // cells whose guess came in this step
+    // Bits of `open` besides those of the surfaces that were not reached: the ground is known; its guess was not
+    // reached; it came in this step; levels of the cell were entered.
+    static constexpr uint16_t KNOWN = 1 << 12, GUESS = 1 << 13, FRESH = 1 << 14, ENTERED = 1 << 15;
+    static constexpr int SHIFT = 27;
+    std::vector<uint16_t> open;       // (cells)
+    std::vector<int32_t> blind;       // (cells) cells since the last surface
+    std::vector<int32_t> wave, next;  // nodes: surface << SHIFT | cell
+    std::vector<int32_t> fresh;       // cells whose guess came in this step
+    std::vector<std::pair<int32_t, int>> nodes;  // entry and surface
+    int64_t number = 0;                          // of nodes in `next`
+    int64_t undecided = 0;                       // cells with levels that were entered, and that were not reached
+    int32_t step = 0;
 
     static int64_t nearest_of(const float* centers, int64_t size, float value) {
         int64_t best = 0;
         for (int64_t k = 1; k < size; k++)
             if (std::fabs(centers[k] - value) < std::fabs(centers[best] - value)) best = k;
         return best;
+    }
+
+    // The highest surface of a cell below some height, -1 for none.
+    int top_below(int64_t c, float limit) const {
+        int top = height[c] <= limit ? 0 : -1;
+        if (entry[c] < 0) return top;
+        const float* const all = several[entry[c]].height;
+        for (int k = 1; k < K; k++)
+            if (all[k] <= limit && (top < 0 || all[k] > all[top])) top = k;
+        return top;
     }
 
     Standing search(const float* base, const float* x, const float* y, int64_t i0, int64_t i1, int64_t j0, int64_t j1,
@@ -117,43 +164,59 @@ struct Search {
             for (int64_t j = std::max<int64_t>(j0, 0); j <= std::min(j1, W - 1); j++) {
                 const float dx = x[i] - base[0], dy = y[j] - base[1], away = dx * dx + dy * dy;
                 if (!(away < square)) continue;
-                int top = -1;
-                for (int k = 0; k < K; k++) {
-                    const float h = height[k * cells + at(i, j)];
-                    if (h <= base[2] && (top < 0 || h > height[top * cells + at(i, j)])) top = k;
-                }
-                if (top < 0 || (is_firm && !(firm[at(i, j)] >> top & 1))) continue;
-                best = {at(i, j), top, height[top * cells + at(i, j)], true}, square = away;
+                const int64_t c = at(i, j);
+                const int top = top_below(c, base[2]);
+                if (top < 0) continue;
+                const bool has_many = entry[c] < 0 ? support[i * W + j] >= SETTLED : several[entry[c]].firm >> top & 1;
+                if (is_firm && !has_many) continue;
+                best = {c, top, top > 0 ? several[entry[c]].height[top] : height[c], true}, square = away;
             }
         return best;
     }
 
+    bool touches_ground(const Several& own, int k) const {
+        for (const int64_t away : {-pitch, pitch, int64_t(-1), int64_t(1)})
+            if (std::fabs(height[own.cell + away] - own.height[k]) <= max_step) return true;
+        return false;
+    }
+
+    // Whether a level is a step from a height, and the ground below it is not.
+    bool leads_up(const Several& own, int k, float from) const {
+        return std::fabs(from - own.height[k]) <= max_step && !(std::fabs(from - own.height[0]) <= max_step);
+    }
+
+    void mark(Several& own, int k) {
+        if (own.entered >> k & 1) return;
+        own.entered |= uint16_t(1 << k), nodes.emplace_back(int32_t(&own - several.data()), k);
+    }
+
     void reach(int k, int64_t c) {
         open[c] &= uint16_t(~(k == K ? GUESS : 1 << k)), next[number++] = int32_t(k) << SHIFT | int32_t(c);
-        if (!(open[c] & SEVERAL)) return;
+        if (!(open[c] & ENTERED)) return;
+        Several& own = several[entry[c]];
         const int8_t surface = k == K ? NONE : int8_t(k);
-        if (first[c] == UNDECIDED) first[c] = surface, decided_in[c] = step, undecided--;
-        else if (decided_in[c] == step && surface != NONE && (first[c] == NONE || surface < first[c])) first[c] = surface;
+        if (own.first == UNDECIDED) own.first = surface, own.decided_in = step, undecided--;
+        else if (own.decided_in == step && surface != NONE && (own.first == NONE || surface < own.first)) own.first = surface;
     }
 
     // Reach the cells beside those of the first `size` nodes of the wave.
     void spread(int64_t size) {
         const float* const ground = height.data();
-        const int32_t* const nodes = wave.data();
+        const int32_t* const nodes_of_wave = wave.data();
         uint16_t* const left = open.data();
         int32_t* const to = next.data();
         const int64_t aside[] = {-pitch, pitch, -1, 1};
         int64_t count = 0;
         for (int64_t n = 0; n < size; n++) {
-            const int k = nodes[n] >> SHIFT;
-            const int64_t c = nodes[n] & ((1 << SHIFT) - 1);
-            const float from = k < K ? height[k * cells + c] : guess[c];
+            const int k = nodes_of_wave[n] >> SHIFT;
+            const int64_t c = nodes_of_wave[n] & ((1 << SHIFT) - 1);
+            const float from = k == 0 || k == K ? height[c] : several[entry[c]].height[k];
             const int32_t gone = k < K ? 0 : blind[c];
             const float limit = max_step + rise * float(gone);
             for (const int64_t away : aside) {
                 const int64_t beside = c + away;
                 const uint16_t bits = left[beside];
-                if (bits & ~1) {
+                if (bits & ~(1 | KNOWN)) {
                     number = count, visit(beside, from, gone, limit), count = number;
                 } else {  // mostly: the ground alone, or nothing, without a branch
                     const bool reaches = (bits & 1) & (std::fabs(ground[beside] - from) <= limit);
@@ -165,15 +228,16 @@ struct Search {
     }
 
     void visit(int64_t c, float from, int32_t gone, float limit) {
-        for (int k = 0; k < (gone ? 1 : K); k++)  // what is guessed leads to the ground alone
-            if ((open[c] >> k & 1) && std::fabs(height[k * cells + c] - from) <= limit) reach(k, c);
+        if ((open[c] & 1) && std::fabs(height[c] - from) <= limit) reach(0, c);
+        for (int k = 1; k < K && !gone && entry[c] >= 0; k++)  // what is guessed leads to the ground alone
+            if ((open[c] >> k & 1) && std::fabs(several[entry[c]].height[k] - from) <= limit) reach(k, c);
         if (gone >= max_blind) return;
         if (open[c] & GUESS) {
-            guess[c] = from, blind[c] = gone + 1;
+            height[c] = from, blind[c] = gone + 1;
             reach(K, c), open[c] |= FRESH, fresh.push_back(int32_t(c));
         } else if (open[c] & FRESH) {
-            blind[c] = from < guess[c] ? gone + 1 : from == guess[c] ? std::min(blind[c], gone + 1) : blind[c];
-            guess[c] = std::min(guess[c], from);
+            blind[c] = from < height[c] ? gone + 1 : from == height[c] ? std::min(blind[c], gone + 1) : blind[c];
+            height[c] = std::min(height[c], from);
         }
     }
 };

@@ -1,10 +1,10 @@
 // What an update does to levels: step.py, for float32 maps on a CPU.
 
 #include "kernels/threads.h"
-#include "levels/kernel/ground.h"
 #include "levels/kernel/rays.h"
 #include "levels/kernel/surfaces.h"
 #include "levels/kernel/update.h"
+#include "levels/kernel/ground.h"
 
 namespace {
 
@@ -28,7 +28,7 @@ struct Scratch {
     std::vector<uint8_t> simple;               // of `touched`
     std::vector<int32_t> touched, complex, first, sorted;
     std::vector<Waiting> waiting;              // of `complex`
-    std::vector<int32_t> there;                // level * cells + cell, of the search
+    std::vector<std::vector<int32_t>> with_levels;  // cells, of each part of the window
     levels::Search search;
 };
 
@@ -400,16 +400,19 @@ struct Map {
     // Merge surfaces that meet, and clear those that rays passed through; note the highest rays.
     void tidy() {
         std::atomic<int64_t> merged{0}, cleared{0};
-        parts(u.H, [&](int64_t, int64_t begin, int64_t end) {
+        own.with_levels.resize(parts.number);
+        parts(u.H, [&](int64_t part, int64_t begin, int64_t end) {
             int64_t of_part[levels::STATISTICS] = {};
+            std::vector<int32_t>& found = own.with_levels[part];
+            found.clear();
             for (int64_t i = begin; i < end; i++)
-                for_stretches(i, [&](int64_t j, int64_t p, int64_t number) { tidy_stretch(i * u.W + j, p, number, of_part); });
+                for_stretches(i, [&](int64_t j, int64_t p, int64_t n) { tidy_stretch(i * u.W + j, p, n, of_part, found); });
             merged += of_part[levels::MERGED], cleared += of_part[levels::CLEARED];
         });
         statistics[levels::MERGED] += merged, statistics[levels::CLEARED] += cleared;
     }
 
-    void tidy_stretch(int64_t first, int64_t p, int64_t number, int64_t* numbers) const {
+    void tidy_stretch(int64_t first, int64_t p, int64_t number, int64_t* numbers, std::vector<int32_t>& found) const {
         const float *g = u.elevation + b * cells + first, gap = u.min_gap;
         const float *high = &own.highest[first], *low = &own.lowest[first];
         const uint8_t* known = u.validity + b * cells + first;
@@ -424,8 +427,11 @@ struct Map {
             const float* support = u.support + (b * u.L + l) * cells + p;
             for (int64_t n = 0; n < number; n++) most = std::max(most, support[n]);
         }
-        for (int64_t n = 0; most > 0 && n < number; n++)
-            if (has_levels(p + n)) tidy_cell(first + n, p + n, numbers);
+        for (int64_t n = 0; most > 0 && n < number; n++) {
+            if (!has_levels(p + n)) continue;
+            tidy_cell(first + n, p + n, numbers);
+            if (has_levels(p + n)) found.push_back(int32_t(first + n));
+        }
     }
 
     void tidy_cell(int64_t c, int64_t p, int64_t* numbers) const {
@@ -449,13 +455,11 @@ struct Map {
 
     // Choosing the ground ----------------------------------------------------------------------------------------
 
-    // Whether any cell has levels, or heights differ as those of two floors do.
-    bool has_choice() const {
-        const float *support = u.support + b * u.L * cells, *elevation = u.elevation + b * cells;
+    // Whether heights differ as those of two floors do.
+    bool has_floors() const {
+        const float* elevation = u.elevation + b * cells;
         const uint8_t* known = u.validity + b * cells;
-        float most = 0, highest = -INFINITE, lowest = INFINITE;
-        for (int64_t k = 0; k < u.L * cells; k++) most = std::max(most, support[k]);
-        if (most > 0) return true;
+        float highest = -INFINITE, lowest = INFINITE;
         for (int64_t c = 0; c < cells; c++) {
             highest = std::max(highest, known[c] ? elevation[c] : -INFINITE);
             lowest = std::min(lowest, known[c] ? elevation[c] : INFINITE);
@@ -463,56 +467,57 @@ struct Map {
         return u.overlap_radius > 0 && highest - lowest > u.overlap_height;
     }
 
-    // Whether points of this scan will found the ground of a cell that has levels.
-    bool waits(int64_t c) const { return own.list[c] >= 0 && own.waiting[own.list[c]].number > 0 && has_levels(place(c)); }
-
-    // How many points a surface needs to come before the ground of a cell.
-    float rival_of(int64_t c, float lower, float time) const {
-        if (waits(c)) return std::min(own.waiting[own.list[c]].number, levels::SETTLED);
-        const int64_t n = b * cells + c;
-        const bool is_dust = u.ground_time[n] <= time || lower > u.elevation[n];
-        return u.validity[n] && is_dust ? std::min(u.ground_support[n], levels::SETTLED) : 0;
+    void choose() {
+        bool any = false;
+        for (const std::vector<int32_t>& part : own.with_levels) any |= !part.empty();
+        if (!any && !has_floors()) return;
+        levels::Search& search = own.search;
+        begin_search();
+        const levels::Standing standing = search.find_standing(base, own.x.data(), own.y.data());
+        const bool strange = has_strange(standing);
+        if (!search.enter(standing) && !strange) return;
+        search.run(standing, strange);
+        own.changed.assign(cells, 0);
+        for (const levels::Several& several : search.several) {
+            if (several.first <= 0) continue;
+            const int64_t c = (several.cell / search.pitch - 1) * u.W + several.cell % search.pitch - 1;
+            swap(c, several.first - 1), own.changed[c] = 1, statistics[levels::CHOSEN]++;
+        }
+        if (strange) demote_strange(standing);
     }
 
-    void choose() {
-        if (!has_choice()) return;
+    // Give the search the surfaces of the window.
+    void begin_search() {
         levels::Search& search = own.search;
-        search.start(u.H, u.W, int(u.L) + 1);
         search.max_step = u.max_step, search.rise = float(levels::SLOPE * u.resolution), search.max_blind = u.max_blind;
-        own.there.clear();
-        const float least = std::max(u.min_support, 0.5f);
+        search.support = u.ground_support + b * cells;
+        search.start(u.H, u.W, int(u.L) + 1);
         for (int64_t i = 0; i < u.H; i++) {
             const int64_t n = b * cells + i * u.W;
             float* to = &search.height[search.at(i, 0)];
-            uint16_t* firm = &search.firm[search.at(i, 0)];
             for (int64_t j = 0; j < u.W; j++) to[j] = u.validity[n + j] ? u.elevation[n + j] : NAN;
-            for (int64_t j = 0; j < u.W; j++) firm[j] = u.ground_support[n + j] >= levels::SETTLED;
-            for (int64_t j = 0; j < u.W; j++)
-                if (waits(i * u.W + j)) to[j] = own.waiting[own.list[i * u.W + j]].height, firm[j] = 0;
-            for (int64_t l = 0; l < u.L; l++) {
-                const int64_t q = (b * u.L + l) * cells + row[i];
-                to += search.cells;
-                for (int64_t j = 0; j < u.W; j++) {
-                    if (!(u.support[q + column[j]] >= least)) continue;
-                    const float rival = rival_of(i * u.W + j, u.lower[q + column[j]], u.time[q + column[j]]);
-                    if (!(u.support[q + column[j]] >= rival)) continue;
-                    to[j] = u.upper[q + column[j]], own.there.push_back(int32_t((l + 1) * search.cells + search.at(i, j)));
-                    firm[j] |= uint16_t((u.support[q + column[j]] >= levels::SETTLED) << (l + 1));
-                }
-            }
         }
-        const levels::Standing standing = search.find_standing(base, own.x.data(), own.y.data());
-        const bool strange = has_strange(standing);
-        if (!strange && !standing.surface && !search.touches_ground(own.there)) return;
-        search.run(standing, strange);
-        own.changed.assign(cells, 0);
-        for (int64_t i = 0; i < u.H; i++)
-            for (int64_t j = 0; j < u.W; j++) {
-                const int64_t c = i * u.W + j;
-                const int surface = search.first[search.at(i, j)];
-                if (surface > 0) swap(c, surface - 1), own.changed[c] = 1, statistics[levels::CHOSEN]++;
-            }
-        if (strange) demote_strange(standing);
+        for (const std::vector<int32_t>& part : own.with_levels)
+            for (const int32_t c : part) add_levels(c);
+    }
+
+    void add_levels(int64_t c) {
+        levels::Search& search = own.search;
+        levels::Several& to = search.add(search.at(c / u.W, c % u.W));
+        const bool waits = own.list[c] >= 0 && own.waiting[own.list[c]].number > 0;  // points will found its ground
+        if (waits) search.height[to.cell] = own.waiting[own.list[c]].height;
+        else to.firm = u.ground_support[b * cells + c] >= levels::SETTLED;
+        const float ground = to.height[0] = search.height[to.cell];
+        const float number = waits ? own.waiting[own.list[c]].number : u.ground_support[b * cells + c];
+        const Cell cell = cell_at(place(c));
+        for (int64_t l = 0; l < u.L; l++) {
+            const int64_t q = l * cells;
+            const bool is_dust = waits || u.ground_time[b * cells + c] <= cell.time[q] || cell.lower[q] > ground;
+            const float rival = ground == ground && is_dust ? std::min(number, levels::SETTLED) : 0;
+            const bool is_there = cell.support[q] >= std::max({u.min_support, 0.5f, rival});
+            to.height[l + 1] = is_there ? cell.upper[q] : NAN;
+            to.firm |= uint16_t((cell.support[q] >= levels::SETTLED) << (l + 1));
+        }
     }
 
     // Call `work(c, i, j)` for the cells near the robot whose height is of another floor, until it returns true.
