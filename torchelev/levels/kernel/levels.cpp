@@ -120,12 +120,16 @@ struct Map {
         }
         for (int axis = 0; axis < 2; axis++) before[axis] = now[axis];
         const float dt = u.dt[b] > 0 && u.dt[b] < INFINITE ? u.dt[b] : 0, added = u.variance_rate * dt;
-        const int64_t first = b * u.L * cells;
-        float *support = u.support + first, *time = u.time + first, *variance = u.level_variance + first;
-        for (int64_t p = 0; p < u.L * cells; p++) {
+        const int64_t first = b * u.L * cells, number = u.L * cells;
+        grow_older(u.support + first, u.time + first, u.level_variance + first, number, dt, added, u.max_variance);
+    }
+
+    static void grow_older(const float* __restrict support, float* __restrict time, float* __restrict variance,
+                           int64_t number, float dt, float added, float most) {
+        for (int64_t p = 0; p < number; p++) {
             const bool is_there = support[p] > 0;
-            time[p] = is_there ? time[p] + dt : time[p];
-            variance[p] = is_there ? std::min(variance[p] + added, u.max_variance) : variance[p];
+            const float older = std::min(variance[p] + added, most);
+            time[p] = time[p] + (is_there ? dt : 0.0f), variance[p] = is_there ? older : variance[p];
         }
     }
 
@@ -413,25 +417,42 @@ struct Map {
     }
 
     void tidy_stretch(int64_t first, int64_t p, int64_t number, int64_t* numbers, std::vector<int32_t>& found) const {
-        const float *g = u.elevation + b * cells + first, gap = u.min_gap;
-        const float *high = &own.highest[first], *low = &own.lowest[first];
-        const uint8_t* known = u.validity + b * cells + first;
-        float* __restrict top = &free_top(p);
-        uint8_t* __restrict open = &is_open(p);
-        for (int64_t n = 0; n < number; n++) top[n] = std::max(top[n], high[n]);
-        const float *of_ground = u.ground_support + b * cells + first, least = std::max(u.min_support, 0.5f);
-        for (int64_t n = 0; n < number; n++)
-            open[n] |= known[n] & uint8_t((of_ground[n] >= least) & (low[n] < g[n] + 0.5f * gap) & (high[n] >= g[n] + gap));
-        float most = 0;  // mostly 0: no cell of the stretch has levels
+        const int64_t n = b * cells + first;
+        const Space space{u.elevation + n, &own.highest[first], &own.lowest[first], u.ground_support + n, u.validity + n};
+        raise_free_top(space, &free_top(p), &is_open(p), number, u.min_gap, std::max(u.min_support, 0.5f));
+        for (int64_t begin = 0; begin < number; begin += BLOCK) {
+            const int64_t size = std::min(BLOCK, number - begin);
+            if (!any_levels(p + begin, size)) continue;  // mostly
+            for (int64_t k = begin; k < begin + size; k++) {
+                if (!has_levels(p + k)) continue;
+                tidy_cell(first + k, p + k, numbers);
+                if (has_levels(p + k)) found.push_back(int32_t(first + k));
+            }
+        }
+    }
+
+    bool any_levels(int64_t p, int64_t number) const {
+        int32_t any = 0;
         for (int64_t l = 0; l < u.L; l++) {
             const float* support = u.support + (b * u.L + l) * cells + p;
-            for (int64_t n = 0; n < number; n++) most = std::max(most, support[n]);
+            for (int64_t n = 0; n < number; n++) any |= support[n] > 0;
         }
-        for (int64_t n = 0; most > 0 && n < number; n++) {
-            if (!has_levels(p + n)) continue;
-            tidy_cell(first + n, p + n, numbers);
-            if (has_levels(p + n)) found.push_back(int32_t(first + n));
-        }
+        return any;
+    }
+
+    // What is known of the space over a row of cells.
+    struct Space {
+        const float *ground, *high, *low, *support;  // the ground, and the highest and lowest ray [m]; points of the ground
+        const uint8_t* known;
+    };
+
+    static void raise_free_top(const Space& space, float* __restrict top, uint8_t* __restrict open, int64_t number,
+                               float gap, float least) {
+        const float *g = space.ground, *high = space.high, *low = space.low, *support = space.support;
+        const uint8_t* known = space.known;
+        for (int64_t n = 0; n < number; n++) top[n] = std::max(top[n], high[n]);
+        for (int64_t n = 0; n < number; n++)
+            open[n] |= known[n] & uint8_t((support[n] >= least) & (low[n] < g[n] + 0.5f * gap) & (high[n] >= g[n] + gap));
     }
 
     void tidy_cell(int64_t c, int64_t p, int64_t* numbers) const {
@@ -457,14 +478,19 @@ struct Map {
 
     // Whether heights differ as those of two floors do.
     bool has_floors() const {
+        constexpr int64_t LANES = 16;  // side by side: the compiler may not reorder extremes of numbers
+        float highest[LANES], lowest[LANES];
+        std::fill_n(highest, LANES, -INFINITE), std::fill_n(lowest, LANES, INFINITE);
         const float* elevation = u.elevation + b * cells;
         const uint8_t* known = u.validity + b * cells;
-        float highest = -INFINITE, lowest = INFINITE;
-        for (int64_t c = 0; c < cells; c++) {
-            highest = std::max(highest, known[c] ? elevation[c] : -INFINITE);
-            lowest = std::min(lowest, known[c] ? elevation[c] : INFINITE);
+        for (int64_t c = 0; c < cells; c += LANES) {
+            for (int64_t n = 0; n < std::min(LANES, cells - c); n++) {
+                highest[n] = std::max(highest[n], known[c + n] ? elevation[c + n] : -INFINITE);
+                lowest[n] = std::min(lowest[n], known[c + n] ? elevation[c + n] : INFINITE);
+            }
         }
-        return u.overlap_radius > 0 && highest - lowest > u.overlap_height;
+        const float height = *std::max_element(highest, highest + LANES) - *std::min_element(lowest, lowest + LANES);
+        return u.overlap_radius > 0 && height > u.overlap_height;
     }
 
     void choose() {
@@ -493,9 +519,11 @@ struct Map {
         search.support = u.ground_support + b * cells;
         search.start(u.H, u.W, int(u.L) + 1);
         for (int64_t i = 0; i < u.H; i++) {
-            const int64_t n = b * cells + i * u.W;
-            float* to = &search.height[search.at(i, 0)];
-            for (int64_t j = 0; j < u.W; j++) to[j] = u.validity[n + j] ? u.elevation[n + j] : NAN;
+            const uint8_t* known = u.validity + b * cells + i * u.W;
+            const float* elevation = u.elevation + b * cells + i * u.W;
+            float* __restrict to = &search.height[search.at(i, 0)];
+            const int64_t W = u.W;
+            for (int64_t j = 0; j < W; j++) to[j] = known[j] ? elevation[j] : NAN;
         }
         for (const std::vector<int32_t>& part : own.with_levels)
             for (const int32_t c : part) add_levels(c);
