@@ -10,7 +10,7 @@ from torchelev.site.fusion.windows import Alignment, Contribution, Known, Window
 
 _WITHIN_CELL = 1 / 12  # variance of a position that is uniform in a cell of size 1
 _STEEPEST = 1.0  # slope taken where the known neighbours of a cell span no plane
-_MIN_VARIANCE = 1e-10  # [m^2]
+MIN_VARIANCE = 1e-10  # [m^2]
 
 
 def read_entries(
@@ -54,7 +54,7 @@ def read_heights(known: Known, alignment: Alignment, robot: Tensor, place: Tenso
     """Return a window's heights in the site's frame, (K,) each."""
     elevation, variance, age = (layer.view(-1).index_select(0, place).float() for layer in known[1:4])
     elevation = elevation - rise(known, alignment, robot, place, resolution)
-    variance = (variance - known.rate.float().index_select(0, robot) * age).clamp(min=_MIN_VARIANCE)
+    variance = (variance - known.rate.float().index_select(0, robot) * age).clamp(min=MIN_VARIANCE)
     return Heights(elevation, variance, (known.now.index_select(0, robot) - age).float())
 
 
