@@ -81,13 +81,14 @@ def test_nothing_counts_twice(maps):
 
 
 def test_what_a_robot_measures_again_replaces_its_share(maps):
-    (road, _), site = maps, SiteMap(resolution=0.1, levels=LEVELS)
-    for place in line((0.0, -0.5, 0.0), (0.0, 0.5, 0.0), 4):
-        walk(road, BRIDGE, [place])
+    (road, _), site, first = maps, SiteMap(resolution=0.1, levels=LEVELS), at(maps[0], "variance", *MIDDLE, level=1)
+    for place in line((0.0, 1.0, 0.0), (0.0, 1.5, 0.0), 4):
         site.merge(road)
-    own = at(road, "variance", *MIDDLE, level=1)
-    assert read(site, "level1.variance") == pytest.approx(own, rel=0.01)
-    assert read(site, "level1.underside") == pytest.approx(at(road, "underside", *MIDDLE, level=1), abs=1e-3)
+        own, underside = (at(road, layer, *MIDDLE, level=1) for layer in ("variance", "underside"))
+        assert read(site, "level1.variance") == pytest.approx(own, rel=0.01)
+        assert read(site, "level1.underside") == pytest.approx(underside, abs=1e-3)
+        walk(road, BRIDGE, [place])
+    assert own < 0.5 * first, "it was measured again"
 
 
 def test_two_robots_are_twice_as_sure(walked):

@@ -89,7 +89,7 @@ class SiteLevels:
 
     @property
     def layers(self) -> tuple[str, ...]:
-        """The names by which they are read: `level0` is the lowest surface of each cell, the ground included."""
+        """The names by which they are read: those of level 0 are of the lowest surface of each cell."""
         names = (f"level{level}.{name}" for level in range(self.others + 1) for name in _BY_LEVEL)
         return (*MADE, *names) if self else ()
 

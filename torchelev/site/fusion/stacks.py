@@ -54,7 +54,7 @@ def read_stack(emap: ElevationMap, state: MapState, known: Known) -> Stack:
         is_there = (levels.support >= emap.cfg.levels.least_support) & (levels.variance < emap.cfg.fusion.max_variance)
         is_known = torch.cat([is_known, is_there.to(is_known.device)], 1)
         is_open, free_top = levels.is_open.to(is_known.device), levels.free_top.to(free_top)
-    return _from_below(Stack(known.corner, *parts, is_known, is_open, free_top))
+    return _from_below(Stack(known.corner.clone(), *parts, is_known, is_open, free_top))
 
 
 def _from_below(stack: Stack) -> Stack:
