@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from tests.levels.walks import at, line, look, make_map, walk
+from tests.site.helpers import fill
 from torchelev import LevelsConfig
 from torchelev.io.export import load_npz
 from torchelev.sim.exact import covered_scenes
@@ -115,6 +116,25 @@ def test_a_ceiling_that_another_robot_has_seen_since_stays(maps, walked):
     road.levels.support.zero_()
     site.merge(road, time=20.0)
     assert len(surfaces(site)) == 2
+
+
+def test_a_crate_on_open_ground_goes_with_its_robot():
+    """Known ground, and another robot that saw the top of a crate there, which is higher than the gap."""
+    site, first, second = SiteMap(resolution=0.1, levels=LEVELS), make_map(), make_map()
+    first.levels.is_open.fill_(True)
+    site.merge(fill(first, [[-30, -30]], lambda x, y: 0.0 * x), align=False)
+    site.merge(fill(second, [[-30, -30]], lambda x, y: torch.full_like(x, 0.6)), align=False)
+    assert surfaces(site) == pytest.approx([0.0, 0.6], abs=1e-3)
+    site.merge(fill(second, [[-30, -30]], lambda x, y: 0.0 * x), align=False)
+    assert surfaces(site) == pytest.approx([0.0], abs=1e-3)
+
+
+def test_heights_of_a_wall_contradict_each_other():
+    """Nobody knows that the space between them is free."""
+    site = SiteMap(resolution=0.1, levels=LEVELS)
+    for height in (0.0, 2.0):
+        site.merge(fill(make_map(), [[-30, -30]], lambda x, y, z=height: torch.full_like(x, z)), align=False)
+    assert len(surfaces(site)) == 1 and {read(site, "elevation"), read(site, "other_elevation")} == {0.0, 2.0}
 
 
 def test_a_map_gets_its_levels_back_and_each_robot_its_ground(maps):

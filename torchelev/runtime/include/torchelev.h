@@ -145,7 +145,7 @@ torchelev_status torchelev_map_corner(const torchelev_map* map, double corner[2]
 
 /**
  * Copy a layer: "elevation", "variance", "validity", "time", "upper_bound", "traversability", "normal_x", "normal_y",
- * "normal_z", or one of the config's filters.
+ * "normal_z", of a map with levels "ceiling" and "clearance" (inf: nothing hangs there), or one of the config's filters.
  *
  * @param values (H, W), NaN where not known.
  * @param size number of values that fit.
@@ -154,7 +154,7 @@ torchelev_status torchelev_map_layer(const torchelev_map* map, const char* name,
 
 /**
  * Return a tensor of the state by its name in Python, such as "elevation" or "validity": its memory, (H, W), which
- * updates overwrite; null, with an error, without such a tensor.
+ * updates overwrite; null, with an error, without such a tensor. Those of levels begin with "levels_", as in a saved map.
  *
  * @param size_bytes written, unless null.
  */

@@ -185,7 +185,7 @@ def fuse_surfaces(
     change, levels_of = robots.change, range(1, robots.change.now.upper.shape[1])
     parts = [_read(robots, aside, 0), *(_read(robots, pieces.select(change.is_new[:, k]), k) for k in levels_of)]
     if change.gone is not None:
-        for k in levels_of:
+        for k in range(len(levels_of) + 1):
             robot, cell, place = pieces.select(change.gone.is_known[:, k])
             lower, upper = robots.faces(change.gone, (robot, place), k, True)
             gone = Surfaces(cell, lower.elevation, upper.elevation, *upper[1:2], upper.time, upper.time, lower, upper)

@@ -104,7 +104,7 @@ class Change(NamedTuple):
     now: Stack  #: at this merge
     before: Stack | None  #: at the one before, in the present windows, each in the place of the surface that it is now
     is_new: Bool[Tensor, "B K H W"]  #: measured since
-    gone: Stack | None  #: those before that are no more, above the ground; None: there was no merge before
+    gone: Stack | None  #: those before that are no more; None: there was no merge before
 
     @property
     def is_touched(self) -> Bool[Tensor, "B H W"]:
@@ -133,7 +133,7 @@ def compare(stack: Stack, contribution: Contribution | None, elapsed: Int[Tensor
     has_changed = (stack.lower != matched.lower) | (stack.upper != matched.upper) | (stack.variance < matched.variance)
     is_new = find_new(stack.is_known, matched.is_known, has_changed, stack.age, elapsed - contribution.elapsed)
     is_gone = before.is_known & (away.amin(1) > min_gap)
-    is_gone[:, 0] = False  # of the ground the site keeps what it was told
+    is_gone[:, 0] &= stack.is_known[:, 0]  # ground that is unknown again was not seen to be gone
     return Change(stack, matched, is_new, before._replace(is_known=is_gone))
 
 
