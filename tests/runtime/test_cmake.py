@@ -81,14 +81,13 @@ def test_the_loop_names_what_is_wrong(installed, config, tmp_path):
 
 
 GATED = te.ElevationMapConfig(sensor=te.SensorConfig(max_distance=1.5, body=te.BodyConfig()))
-LEVELS = te.ElevationMapConfig(grid=te.GridConfig(length_x=4, length_y=3), levels=te.LevelsConfig())
 FAR = te.ElevationMapConfig(grid=te.GridConfig(length_x=4, length_y=3), raycast=te.RaycastConfig(max_range=30.0))
 
 
 @pytest.mark.parametrize(
     "cfg, max_points, threads",
     [*((te.ElevationMapConfig(), n, t) for n, t in [(10_000, 1), (10_000, 2), (100_000, 2)])]
-    + [(GATED, 10_000, 2), (FAR, 10_000, 1), (LEVELS, 10_000, 2)],
+    + [(GATED, 10_000, 2), (FAR, 10_000, 1)],
 )
 def test_nothing_is_allocated_after_creation(installed, tmp_path, cfg, max_points, threads):
     config = tmp_path / "map.json"

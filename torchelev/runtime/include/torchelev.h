@@ -11,8 +11,9 @@
  * Threads: a map, a scan or an image belongs to one thread at a time; different ones may be used at the same time. What
  * reads a map (layers, samples, statistics) may run on several threads while none updates it.
  *
- * Memory: after a map, a scan or an image is created, updates and reads allocate nothing. A diagnosis does, and so does
- * the first read of a filter's layer after an update.
+ * Memory: after a map, a scan or an image is created, updates and reads allocate nothing. A diagnosis does, and so do
+ * the first read of a filter's layer after an update, and updates of a map with levels that meet more surfaces than those
+ * before.
  */
 #ifndef TORCHELEV_H
 #define TORCHELEV_H

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 _SAME_TIME = 0.01  # [s] more than rounding
 
 
+_OWN = ("cell", "lower", "upper", "variance", "support", "time")
+
+
 class Surfaces(NamedTuple):
     """N surfaces in the site's frame. Variances are those right after the last measurement."""
 
@@ -35,7 +38,9 @@ class Surfaces(NamedTuple):
 
     def at(self, chosen: Tensor) -> Surfaces:
         """Return some of them, by number."""
-        return Surfaces(*(value[chosen] for value in self[:6]), self.below.at(chosen), self.above.at(chosen))
+        below, above = self.below.at(chosen), self.above.at(chosen)
+        own = {name: getattr(self, name)[chosen] for name in _OWN}
+        return self._replace(below=below, above=above, **own)
 
 
 class Cells(NamedTuple):
@@ -77,10 +82,15 @@ def join(cells: Cells, new: Surfaces, min_gap: float, rate: float, cfg: SiteConf
         surfaces = here.surfaces._replace(
             **{n: torch.where(chosen, fused[n], getattr(here.surfaces, n)) for n in SURFACE}
         )
-        found = Found(*(value[None] for value in (part.lower, part.upper, part.upper, part.variance)),
-                      torch.zeros_like(part.upper)[None], part.support[None])  # fmt: skip
-        surfaces, _ = insert(surfaces, (~joins & (to_ground > min_gap))[None], found, part.time)
+        is_other = (~joins & (to_ground > min_gap))[None]
+        surfaces, _ = insert(surfaces, is_other, _found(part), part.time)
         cells.put(part.cell, surfaces)
+
+
+def _found(new: Surfaces) -> Found:
+    """Return surfaces as a scan shows them, whose faces are as they are."""
+    lower, upper, variance, support = (value[None] for value in (new.lower, new.upper, new.variance, new.support))
+    return Found(lower, upper, upper, variance, torch.zeros_like(upper), support)
 
 
 def _rounds(new: Surfaces) -> Iterator[Surfaces]:

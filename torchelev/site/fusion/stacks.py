@@ -54,7 +54,9 @@ def read_stack(emap: ElevationMap, state: MapState, known: Known) -> Stack:
         is_there = (levels.support >= emap.cfg.levels.least_support) & (levels.variance < emap.cfg.fusion.max_variance)
         is_known = torch.cat([is_known, is_there.to(is_known.device)], 1)
         is_open, free_top = levels.is_open.to(is_known.device), levels.free_top.to(free_top)
-    return _from_below(Stack(known.corner.clone(), *parts, is_known, is_open, free_top))
+    lower, upper, variance, support, age = parts
+    stack = Stack(known.corner.clone(), lower, upper, variance, support, age, is_known, is_open, free_top)
+    return _from_below(stack)
 
 
 def _from_below(stack: Stack) -> Stack:
@@ -156,5 +158,7 @@ def windows_of(windows: Windows, change: Change, resolution: float) -> Windows:
 
 def _first(known: Known, stack: Stack) -> Known:
     """Return what is known of the surfaces in place 0."""
-    layers = (getattr(stack, name)[:, 0].contiguous() for name in ("upper", "variance", "age", "is_known"))
-    return Known(stack.corner, *layers, known.now, known.rate)
+    upper, variance, age, is_known = (
+        getattr(stack, name)[:, 0].contiguous() for name in ("upper", "variance", "age", "is_known")
+    )
+    return Known(stack.corner, upper, variance, age, is_known, known.now, known.rate)
