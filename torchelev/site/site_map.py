@@ -145,6 +145,8 @@ class SiteMap(OpenedSite):
         the layers `other_elevation`, `other_variance` and `other_time` hold the one that it contradicts. Channels that
         the site keeps are those of its elevation: means by weight, counts of classes added up, the largest of maxima,
         and of "exponential" and "class_average" what was measured last. Maps may lack channels that the site keeps.
+        A site with levels takes all surfaces of maps with levels, and the ground of others; the lowest surface of each
+        cell is its ground.
 
         Args:
             emap: the map, of the site's resolution. The site recognises it, not copies of it.

@@ -64,14 +64,6 @@ class Fused(NamedTuple):
     is_contradicted: Bool[Tensor, "K"]  #: entries of cells in which heights contradict each other
 
 
-def fuse_entries(layers: Float[Tensor, "L C"], entries: Entries, rate: float, cfg: SiteConfig) -> Bool[Tensor, "K"]:
-    """Fuse entries into the layers of tiles, in place; return which contradict other heights of their cells."""
-    fused = fuse(Heights(*layers[0:3]), Heights(*layers[4:7]), entries, rate, cfg)
-    for row, value in zip((0, 1, 2, 4, 5, 6), (*fused.first, *fused.other), strict=True):
-        layers[row] = value
-    return fused.is_contradicted
-
-
 def fuse(first: Heights, other: Heights, entries: Entries, rate: float, cfg: SiteConfig) -> Fused:
     """Fuse entries into cells. The result does not depend on the order of the entries, up to rounding.
 

@@ -10,8 +10,8 @@ from torch import Tensor
 from torchelev.levels.config import LevelsConfig
 from torchelev.levels.state import SURFACE, Levels
 from torchelev.levels.surfaces import SETTLED
-from torchelev.site.fusion.entries import MIN_VARIANCE, rise
-from torchelev.site.fusion.fuse import Entries, Heights, fuse_entries
+from torchelev.site.fusion.entries import MIN_VARIANCE, fuse_entries, rise
+from torchelev.site.fusion.fuse import Entries, Heights
 from torchelev.site.fusion.join_surfaces import Cells, Surfaces, join, tidy, withdraw
 from torchelev.site.fusion.pieces import Pieces
 from torchelev.site.fusion.stacks import Change, Stack, compare, read_stack, windows_of
@@ -178,37 +178,45 @@ def raise_ground(
 
 
 def fuse_surfaces(
-    cells: Cells, robots: Robots, pieces: Pieces, aside: tuple[Tensor, ...], levels: LevelsConfig, rate: float,
+    cells: Cells,
+    robots: Robots,
+    pieces: Pieces,
+    aside: tuple[Tensor, Tensor, Tensor],
+    levels: LevelsConfig,
+    rate: float,
     cfg: SiteConfig,
-) -> Cells:  # fmt: skip
+) -> Cells:
     """Return cells with the robots' surfaces above the ground; `aside`: robots, cells, places of their lowest ones."""
-    change, levels_of = robots.change, range(1, robots.change.now.upper.shape[1])
-    parts = [_read(robots, aside, 0), *(_read(robots, pieces.select(change.is_new[:, k]), k) for k in levels_of)]
-    if change.gone is not None:
-        for k in range(len(levels_of) + 1):
-            robot, cell, place = pieces.select(change.gone.is_known[:, k])
-            lower, upper = robots.faces(change.gone, (robot, place), k, True)
-            gone = Surfaces(cell, lower.elevation, upper.elevation, *upper[1:2], upper.time, upper.time, lower, upper)
-            withdraw(cells, gone, levels.min_gap)
+    change, others = robots.change, range(1, robots.change.now.upper.shape[1])
+    for level in range(len(others) + 1) if change.gone is not None else ():
+        withdraw(cells, _read_gone(robots, pieces, level), levels.min_gap)
+    parts = [_read(robots, aside, 0), *(_read(robots, pieces.select(change.is_new[:, k]), k) for k in others)]
     for part in parts:
         join(cells, part, levels.min_gap, rate, cfg)
     return tidy(cells, levels.min_gap)
 
 
-def _read(robots: Robots, chosen: tuple[Tensor, ...], level: int) -> Surfaces:
+def _read(robots: Robots, chosen: tuple[Tensor, Tensor, Tensor], level: int) -> Surfaces:
     """Return the surfaces in one place of windows, for robots, cells of the site and places of the flat windows."""
     (robot, cell, place), change = chosen, robots.change
     lower, upper = robots.faces(change.now, (robot, place), level, False)
     support = change.now.support[:, level].flatten()[place]
-    before = (
-        Heights(*[torch.full_like(lower.time, torch.nan)] * 3),
-        Heights(*[torch.full_like(lower.time, torch.nan)] * 3),
-    )
+    below = above = Heights(*[torch.full_like(lower.time, torch.nan)] * 3)
     if change.before is not None:
         counts = change.before.is_known[:, level].flatten()[place]
         earlier = robots.faces(change.before, (robot, place), level, True)
-        before = tuple(h._replace(time=torch.where(counts, h.time, torch.nan)) for h in earlier)  # type: ignore[assignment]
-    return Surfaces(cell, lower.elevation, upper.elevation, upper.variance, support, upper.time, *before)
+        below, above = (h._replace(time=torch.where(counts, h.time, torch.nan)) for h in earlier)
+    return Surfaces(cell, lower.elevation, upper.elevation, upper.variance, support, upper.time, below, above)
+
+
+def _read_gone(robots: Robots, pieces: Pieces, level: int) -> Surfaces:
+    """Return the surfaces in one place of windows that robots have cleared since their last merge."""
+    gone = robots.change.gone
+    assert gone is not None
+    robot, cell, place = pieces.select(gone.is_known[:, level])
+    lower, upper = robots.faces(gone, (robot, place), level, True)
+    support = gone.support[:, level].flatten()[place]
+    return Surfaces(cell, lower.elevation, upper.elevation, upper.variance, support, upper.time, lower, upper)
 
 
 def write_cells(

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from torchelev.ops.parallel import map_in_order
-from torchelev.site.fusion.entries import read_entries, rise
-from torchelev.site.fusion.fuse import fuse_entries
+from torchelev.site.fusion.entries import fuse_entries, read_entries, rise
 from torchelev.site.fusion.fuse_levels import Robots, fuse_levels
 from torchelev.site.fusion.fuse_shares import fuse_channels
 from torchelev.site.fusion.pieces import Group, Pieces, group_tiles

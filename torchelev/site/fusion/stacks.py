@@ -63,16 +63,14 @@ def _from_below(stack: Stack) -> Stack:
     """Return surfaces whose place 0 is the lowest one, of cells whose ground, in place 0, is known."""
     has_ground = stack.is_known[:, :1]
     below = has_ground & stack.is_known & (stack.upper < stack.upper[:, :1])
-    lowest = torch.where(below, stack.upper, torch.inf).argmin(1, keepdim=True)
-    lowest = torch.where(below.any(1, keepdim=True), lowest, 0)
-    order = (
-        torch.arange(stack.upper.shape[1], device=lowest.device)[:, None, None].expand(stack.upper.shape).contiguous()
-    )
-    order = order.scatter(1, lowest, 0)
-    order[:, :1] = lowest
-    sorted_ = stack._replace(**{name: getattr(stack, name).gather(1, order) for name in _OF_SURFACES})
-    has_others = has_ground[:, 0] & sorted_.is_known[:, 1:].any(1)
-    return sorted_._replace(is_open=has_others | (stack.is_open & (lowest[:, 0] == 0)))
+    is_same = ~below.any(1)
+    if not is_same.all():
+        place = torch.where(below, stack.upper, torch.inf).argmin(1, keepdim=True) * ~is_same[:, None]
+        order = torch.arange(stack.upper.shape[1], device=place.device)[:, None, None].expand(stack.upper.shape)
+        order = torch.cat([place, order.scatter(1, place, 0)[:, 1:]], 1)
+        stack = stack._replace(**{name: getattr(stack, name).gather(1, order) for name in _OF_SURFACES})
+    has_others = has_ground[:, 0] & stack.is_known[:, 1:].any(1)
+    return stack._replace(is_open=has_others | (stack.is_open & is_same))
 
 
 def move_stack(stack: Stack, corner: Int[Tensor, "B 2"]) -> Stack:

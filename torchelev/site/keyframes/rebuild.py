@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.site.fusion.fuse import Entries, Heights, fuse_entries
+from torchelev.site.fusion.entries import fuse_entries
+from torchelev.site.fusion.fuse import Entries, Heights
 from torchelev.site.fusion.merge import Merged, lower_bounds
 from torchelev.site.keyframes.keyframe_log import KeyframeLog
 from torchelev.site.keyframes.keyframes import BOUND, CONTRIBUTED, OWN, Recorded, Rows, join
