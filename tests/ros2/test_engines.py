@@ -7,15 +7,18 @@ import numpy as np
 import pytest
 
 import torchelev as te
+from tests.levels.walks import line, look
 from tests.runtime.test_maps import instants
 from torchelev.frames.quaternions import to_rotation
 from torchelev.io.grid_map import from_grid_map, to_grid_map
 from torchelev.io.occupancy import to_occupancy_grid
+from torchelev.levels import LAYERS as CEILINGS
 from torchelev.ros2 import outputs
 from torchelev.ros2.engine import SensorInput, thinned
 from torchelev.ros2.engines import make_engine
 from torchelev.ros2.settings import NodeSettings
 from torchelev.runtime.library import build_library
+from torchelev.sim.exact import covered_scenes
 
 CFG = {"grid": {"resolution": 0.05, "length_x": 4.0, "length_y": 3.0}, "drift": None}
 LAYERS = ("elevation", "variance", "traversability", "upper_bound")
@@ -52,6 +55,21 @@ def test_both_give_the_same(engines):
     T = walk(engine_of("library", build_library()._name), 1)
     assert torch.scan(T).tobytes() == c.scan(T).tobytes() and len(c.scan(T)) == 187
     assert torch.diagnose() == [] == c.diagnose()
+
+
+def test_both_publish_ground_ceiling_and_clearance(library):
+    cfg = {"grid": {"resolution": 0.1, "length_x": 6.0, "length_y": 6.0}, "levels": {"max_levels": 3}}
+    layers, scene, maps = ("elevation", *CEILINGS), covered_scenes.bridge(), []
+    for kind in ("torch", "library"):
+        engine = make_engine(cfg, NodeSettings(engine=kind, library=library, layers=layers))
+        for k, place in enumerate(line((0.0, -1.5, 0.0), (0.0, 0.5, 0.0), 4)):
+            points, T_map_sensor, T_map_base = look(scene, *place, seed=k)
+            engine.update(SensorInput(points[0].numpy(), T_map_sensor[0].numpy(), T_map_base[0].numpy(), 0.2))
+        maps.append(from_grid_map(outputs.grid_map(engine, layers)).layers)
+        assert outputs.map_cloud(engine, layers).names == ["x", "y", "z", *CEILINGS]
+    for name in layers:
+        np.testing.assert_allclose(maps[0][name], maps[1][name], rtol=0, atol=2e-5, err_msg=name)
+    assert np.nanmedian(maps[1]["ceiling"]) == pytest.approx(12 * covered_scenes.RISE - 0.25, abs=0.02)
 
 
 def test_pytorchs_diagnosis_runs_beside_updates(library, monkeypatch):

@@ -114,6 +114,21 @@ def test_one_input_for_each_group_with_an_image(run, tmp_path):
     assert [line.split(":")[0] for line in lines] == ["same"] * 3
 
 
+def test_a_map_with_levels_and_an_image_of_the_clearance(library, run, tmp_path, monkeypatch):
+    image = te.MapImage(length_x=0.8, length_y=0.8, resolution=0.1, layers=("elevation", "clearance"))
+    monkeypatch.setitem(globals(), "IMAGE", image)
+    grid = te.GridConfig(resolution=0.05, length_x=3, length_y=3)
+    record(run, {"body": NAMES, "image": image}, te.ElevationMapConfig(grid=grid, levels=te.LevelsConfig()))
+    save_policy(run / POLICY, 3, image.shape)
+    invoke("export", run, "--out", tmp_path / "bundle")
+    lines = invoke("check", tmp_path / "bundle").splitlines()
+    assert [line.split(":")[0] for line in lines] == ["same"] * 3 and "largest difference 0" in lines[1]
+    described = json.loads((run / OBSERVATION).read_text())
+    assert described["groups"][1]["image"]["max_clearance"] == 3.0
+    with pytest.raises(ValueError, match="groups.scan: must scan no ceilings, which bundles do not hold"):
+        Recorder(te.ElevationMap(num_envs=1), {"scan": te.HeightScan.grid(surface="ceiling")})
+
+
 def test_what_differs_is_named_with_the_figure(library, run, tmp_path):
     save_policy(run / POLICY, 3 + SCAN.num_points + FEET.num_points, weight=0.75)
     with np.load(run / EPISODE) as arrays:

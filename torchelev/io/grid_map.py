@@ -141,9 +141,9 @@ def to_grid_map(
 
 
 def _flat(name: str, values: NDArray, emap: ElevationMap) -> NDArray:
-    """Return a layer (H, W): a colour (3, H, W) packed, ceilings that are not there as NaN, all else as it is."""
+    """Return a layer (H, W): a colour (3, H, W) packed, all else as it is."""
     if values.ndim == 2:
-        return np.where(np.isinf(values), np.nan, values) if name in LEVEL_LAYERS else values
+        return values
     cfg = emap.cfg.channels[name]
     hint = f"give {', '.join(cfg.components(name))}"
     require(cfg.is_color, "layers", "must have one value for each cell", f"{name!r} with {cfg.size}", hint)
@@ -160,7 +160,7 @@ def pack_colors(rgb: NDArray) -> NDArray[np.float32]:
 def grid_map_of(
     layers: Mapping[str, NDArray], center: Sequence[float], resolution: float, basic_layers: Sequence[str] = ()
 ) -> GridMap:
-    """Return the GridMap of layers (H, W), NaN where unknown.
+    """Return the GridMap of layers (H, W), NaN where unknown, and where a ceiling is infinite: nothing hangs there.
 
     Args:
         layers: by name.
@@ -171,7 +171,8 @@ def grid_map_of(
     rows, columns = next(iter(layers.values())).shape
     place = Pose(Point(float(center[0]), float(center[1])))
     info = GridMapInfo(resolution, rows * resolution, columns * resolution, place)
-    data = [_to_multi_array(layer) for layer in layers.values()]
+    finite = {n: np.where(np.isinf(v), np.nan, v) if n in LEVEL_LAYERS else v for n, v in layers.items()}
+    data = [_to_multi_array(layer) for layer in finite.values()]
     return GridMap(info, list(layers), list(basic_layers), data)
 
 

@@ -92,7 +92,7 @@ class MapLevels(nn.Module):
         else:
             m = measure(*inputs, self.cfg.grid, self.cfg.sensor, state.elevation.dtype)
             recenter(state, inputs)
-            step = update_levels(self._of_maps(state), state, m, self.cfg)
+            step = update_levels(self.in_windows(state), state, m, self.cfg)
             map_layers(lambda old, new: old if new is old else old.copy_(new), state, step.state)
             self._write(step.levels, state.corner)
             aside, statistics = step.aside.view(inputs.points.shape[:3]), step.statistics
@@ -113,9 +113,14 @@ class MapLevels(nn.Module):
     @torch.no_grad()
     def follow(self, state: MapState) -> None:
         """Follow windows that moved besides updates."""
-        self._write(self._of_maps(state), state.corner)
+        self._write(self.in_windows(state), state.corner)
 
-    def _of_maps(self, state: MapState) -> Levels:
+    @torch.no_grad()
+    def put(self, levels: Levels, state: MapState) -> None:
+        """Replace the levels, given in the windows of the maps."""
+        self._write(levels, state.corner)
+
+    def in_windows(self, state: MapState) -> Levels:
         """Return the levels in the windows of the maps."""
         largest = max(self.cfg.grid.height, self.cfg.grid.width)
         shift = (state.corner - self.corner).clamp(-largest, largest)
@@ -138,10 +143,10 @@ class MapLevels(nn.Module):
     @torch.no_grad()
     def forget_cells(self, state: MapState, cells: Bool[Tensor, "B H W"]) -> None:
         """Forget the surfaces of some cells of the maps."""
-        levels = self._of_maps(state)
+        levels = self.in_windows(state)
         levels = remove(levels, cells[:, None].expand(levels.lower.shape))
         self._write(forget_space(levels, cells), state.corner)
 
     def view(self, state: MapState) -> View:
         """Return what is known of all surfaces, the ground of a state of the maps included."""
-        return view(self._of_maps(state), state, self.cfg)
+        return view(self.in_windows(state), state, self.cfg)

@@ -120,6 +120,7 @@ class RestartableMap(PaintedMap, ReadableMap):
         """Start with what a site knows: heights, their variances at their present age, and upper bounds.
 
         Only unknown cells are filled, and what comes from the site does not count as measured when it is merged back.
+        A map with levels gets those of a site with levels, and chooses its ground by its first update with T_map_base.
         Heights are the site's; those of a robot that has merged since its last `reset` are raised by its offset.
 
         Args:

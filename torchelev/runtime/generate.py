@@ -21,6 +21,7 @@ from torchelev.inputs.checks import FARTHEST
 from torchelev.kernels.cpu_update import Inputs
 from torchelev.kernels.registry import header
 from torchelev.kernels.structs import Double, members
+from torchelev.levels.config import MAX_LEVELS, SEPARATIONS
 from torchelev.observations import presets
 from torchelev.observations.ground import MARGIN, MAX_BLOCK
 from torchelev.observations.height_scan import HeightScan
@@ -42,6 +43,7 @@ _ONLY_PYTHON = (RobotBody, LearnedTraversabilityConfig)  # settings of these typ
 _PLANNING = (RobotConfig,)  # settings that no update reads
 # The filters of the library that have settings: `KINDS` in source/filters/kinds.cpp.
 _FILTERS = ("box", "gaussian", "inpaint_diffusion", "inpaint_minimum", "median")
+_CHOICES = {"separation": SEPARATIONS}  # words of settings
 _DTYPES = {"float": "F32", "int64_t": "I64", "uint8_t": "U8"}  # of safetensors
 
 
@@ -51,6 +53,7 @@ _CONSTANTS: tuple[tuple[str, str, float], ...] = (
     ("int", "MAX_RADIUS", MAX_RADIUS),  # [cells]
     ("int", "MAX_REFINEMENTS", MAX_REFINEMENTS),
     ("int", "MAX_CELLS", MAX_CELLS),  # of a ray
+    ("int", "MAX_LEVELS", MAX_LEVELS),
     ("double", "MIN_RESOLUTION", MIN_RESOLUTION),  # [m]
     ("double", "FARTHEST", FARTHEST),  # [m]
     ("double", "STEP_REACH", STEP_REACH),  # [m]
@@ -91,6 +94,7 @@ def _tables() -> str:
         [
             _NOTE + '#pragma once\n\n#include "runtime/source/table_types.h"\n',
             _table("Setting", "SETTINGS", _settings(ElevationMapConfig(), "")),
+            _table("Choice", "CHOICES", _choices()),
             _table("Tensor", "STATE", _tensors()),
             _constants(_CONSTANTS),
             _in_namespace(
@@ -148,10 +152,10 @@ def _settings(cfg: Any, prefix: str) -> Iterator[str]:
 def _kind(name: str, kinds: list[Any]) -> str:
     if name == "filters":
         return "CHAIN"
-    if name in ("completion", "channels", "levels") or any(
-        isinstance(k, type) and issubclass(k, ByTensors) for k in kinds
-    ):
+    if name in ("completion", "channels") or any(isinstance(k, type) and issubclass(k, ByTensors) for k in kinds):
         return "ONLY_PYTHON"
+    if name in _CHOICES:
+        return "CHOICE"
     if any(kind in _PLANNING for kind in kinds):
         return "IGNORED"
     if any(dataclasses.is_dataclass(kind) for kind in kinds):
@@ -163,8 +167,16 @@ def _kind(name: str, kinds: list[Any]) -> str:
 
 def _setting(path: str, kind: str, nullable: bool, value: Any) -> str:
     numbers = value if kind == "PLACE" else (value,) if kind in ("NUMBER", "INTEGER") else ()
+    if kind == "CHOICE":
+        numbers = (_CHOICES[path.split(".")[-1]].index(value),)
     texts = ", ".join(_number(number) for number in numbers if number is not None)
     return f'{{"{path}", {kind}, {str(nullable).lower()}, {str(value is None).lower()}, {{{texts}}}}}'
+
+
+def _choices() -> Iterator[str]:
+    """Yield a row for each word of each setting that is one of several."""
+    for name, words in _CHOICES.items():
+        yield from (f'{{"{name}", "{word}"}}' for word in words)
 
 
 def _default_settings() -> str:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchelev.site.fusion.entries import rise
+from torchelev.site.fusion.stacks import age_stack, move_stack
 from torchelev.site.fusion.windows import Contribution, move_known
 from torchelev.stages.initialize import Remembered, recall
 from torchelev.stages.recenter.stage import follow
@@ -35,12 +36,15 @@ def move_contribution(
 ) -> Contribution:
     """Return a contribution with the windows at other corners, and as of another time [s]."""
     known = move_known(contribution.known, corner)
-    passed = (now - known.now)[:, None, None]
-    age, variance = known.age + passed, known.variance + known.rate[:, None, None] * passed
+    passed = now - known.now
+    age = known.age + passed[:, None, None]
+    variance = known.variance + (known.rate * passed)[:, None, None]
     known = known._replace(age=age.to(known.age), variance=variance.to(known.variance), now=known.now * 0 + now)
-    moved = (corner - contribution.known.corner) * resolution  # tilts turn about the windows' centres
-    offset = contribution.alignment.offset + (contribution.alignment.tilt * moved).sum(1)
-    return contribution._replace(known=known, alignment=contribution.alignment._replace(offset=offset))
+    alignment = contribution.alignment.of_moved((corner - contribution.known.corner) * resolution)
+    stack = contribution.stack
+    if stack is not None:
+        stack = age_stack(move_stack(stack, corner), passed, known.rate)
+    return contribution._replace(known=known, alignment=alignment, stack=stack)
 
 
 def fill(

@@ -19,6 +19,7 @@ from torchelev.site.readable_site import ReadableSite
 from torchelev.site.shared.collective import shared_transaction
 from torchelev.site.shared.ranks import Ranks
 from torchelev.site.site_config import SiteConfig
+from torchelev.site.site_levels import SiteLevels
 from torchelev.site.tiles import LAYERS, Tiles
 
 if TYPE_CHECKING:
@@ -71,18 +72,21 @@ class OpenedSite(ReadableSite):
         site._begin(device)
         return site
 
-    def _begin(self, device: torch.device | str, channels: SiteChannels | None = None) -> None:
+    def _begin(
+        self, device: torch.device | str, channels: SiteChannels | None = None, levels: SiteLevels | None = None
+    ) -> None:
         """Start with what is stored, or with nothing."""
         if self._store is not None:  # of a site without channels, there may be no such attribute
             channels = SiteChannels(self._store.attributes.get("channels"), LAYERS, self._store.layers)
-        self._tiles = Tiles(self._store, self.cfg.cache_tiles, device, channels)
+            levels = SiteLevels.of(self._store.attributes)
+        self._tiles = Tiles(self._store, self.cfg.cache_tiles, device, channels, levels)
         self._id, self._rate = uuid.uuid4().hex, self.cfg.variance_rate
         self._epoch = self._time = self._opened = 0.0  # the last two count from the first
         self._num_commits, self._interrupted = 0, None
         self._read_attributes()
 
-    def _check_keyframes(self, wanted: bool, channels: SiteChannels) -> None:
-        """Raise ValueError unless the site can keep keyframes and channels as wanted."""
+    def _check_kept(self, wanted: bool, channels: SiteChannels, levels: SiteLevels) -> None:
+        """Raise ValueError unless the site can keep keyframes, channels and levels as wanted."""
         kept, hint = self._keyframes is not None, "begin another"
         own = self._tiles.channels
         try:
@@ -94,6 +98,8 @@ class OpenedSite(ReadableSite):
             rule, actual = "must be kept from the first merge on", ", ".join(channels.layers)
             require(not channels or own.configs == channels.configs, "channels", rule, actual,
                     f"leave them out: the site has {', '.join(own.layers) or 'none'}")  # fmt: skip
+            self._tiles.levels.require_alone(is_alone)
+            self._tiles.levels.require_same(levels)
         except ValueError:
             self.close()
             raise
@@ -121,6 +127,7 @@ class OpenedSite(ReadableSite):
         own["num_commits"] = self._num_commits + 1
         merges = None if self._keyframes is None else self._keyframes.num_merges + new_merges
         own["channels"] = self._tiles.channels.attributes
+        own |= self._tiles.levels.attributes
         return own | {"variance_rate": self._rate, "keyframe_merges": merges}
 
     def _read_attributes(self) -> None:

@@ -91,7 +91,7 @@ class ReadableSite:
         require(is_list, "xy", "expected (M, 2)", tuple(xy.shape), "give one x and y for each point")
         require(mode in MODES, "mode", f"must be one of {', '.join(MODES)}", repr(mode), "use bilinear")
         cells = xy.detach().to(self._tiles.device, torch.float64) / self.resolution
-        return sample_tiles(self._tiles, cells, check_layer("layer", layer, self._tiles.channels), mode, self._clock)
+        return sample_tiles(self._tiles, cells, check_layer("layer", layer, self._tiles), mode, self._clock)
 
     def window(
         self,
@@ -106,6 +106,9 @@ class ReadableSite:
           `ElevationMap.layer`.
         - other_elevation [m], other_variance [m^2] and other_time [s]: what contradicts the elevation.
         - a channel of the site, or one of its components, such as "rgb" or "rgb.red".
+        - of a site with levels: ceiling [m] and clearance [m] above the elevation, inf where nothing hangs, and
+          level0.elevation, .underside [m], .variance [m^2] and .time [s] of each cell's lowest surface, level1 of the
+          next one.
 
         Args:
             center: x, y [m], map frame; the area's centre is the nearest point at which its cells line up.
@@ -127,7 +130,7 @@ class ReadableSite:
         is_point = len(point) == 2 and all(map(math.isfinite, point))
         require(is_point, "center", "expected x, y in metres", point, "give (0.0, 0.0), say")
         x, y = (math.floor(c / self.resolution - n / 2 + 0.5) for c, n in zip(point, (height, width), strict=True))
-        return self._copy((x, y), (height, width), check_layers(layers, self._tiles.channels))
+        return self._copy((x, y), (height, width), check_layers(layers, self._tiles))
 
     def _copy(self, corner: tuple[int, int], size: tuple[int, int], names: Sequence[str]) -> SavedMap:
         """Copy an area whose first cell has these numbers on the lattice."""
@@ -135,14 +138,16 @@ class ReadableSite:
         grid = grid_of(size, self.resolution)
         middle = [(c + n / 2) * self.resolution for c, n in zip(corner, size, strict=True)]
         arrays = {name: value.numpy() for name, value in area.items()}
-        config = ElevationMapConfig(grid=grid, channels=self._tiles.channels.configs).to_dict()
+        config = ElevationMapConfig(
+            grid=grid, channels=self._tiles.channels.configs, levels=self._tiles.levels.cfg
+        ).to_dict()
         return SavedMap(arrays, self.resolution, np.array([*middle, 0.0]), config)
 
     def windows(
         self, corner: Int[Tensor, "B 2"], height: int, width: int, layers: Sequence[str]
     ) -> dict[str, Float[Tensor, "B H W"]]:
         """Return layers of B areas of height x width cells, whose first cells have these numbers on the lattice."""
-        names, size = check_layers(layers, self._tiles.channels), (height, width)
+        names, size = check_layers(layers, self._tiles), (height, width)
         areas = [read_area(self._tiles, (x, y), size, names, self._clock) for x, y in corner.tolist()]
         return {name: torch.stack([area[name] for area in areas]).to(self._tiles.device) for name in layers}
 
@@ -182,7 +187,7 @@ class ReadableSite:
             WriteError: the file cannot be written, or its folder does not exist; an existing file is left as it was.
             ModuleNotFoundError: a package is missing; the text says which extra installs it.
         """
-        names = check_layers(layers, self._tiles.channels)
+        names = check_layers(layers, self._tiles)
         export(
             path,
             choose_area(self._tiles, names, area, self.resolution, self._copy),

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.layers import surrounding_cells, weighted_mean
-from torchelev.site.channels import SiteChannels
 from torchelev.site.tiles import LAYERS as STORED
 from torchelev.site.tiles import TILE, Tiles, locate
 
@@ -38,28 +37,35 @@ class Clock(NamedTuple):
     rate: float  #: [m^2/s] at which variances grow
 
 
-def check_layers(layers: Sequence[str] | None, channels: SiteChannels) -> tuple[str, ...]:
+def all_layers(tiles: Tiles) -> tuple[str, ...]:
+    """Return the names of all layers of a site."""
+    return (*LAYERS, *tiles.levels.layers, *tiles.channels.layers)
+
+
+def check_layers(layers: Sequence[str] | None, tiles: Tiles) -> tuple[str, ...]:
     """Return names of layers; None: all. TypeError if they are not a list, KeyError if one does not exist."""
     is_list, hint = not isinstance(layers, str), f"give [{layers!r}]"
     require(is_list, "layers", "must be a list of names", repr(layers), hint, TypeError)
     if layers is None:
-        return (*LAYERS, *channels.layers)
-    configs = channels.configs
+        return all_layers(tiles)
+    configs = tiles.channels.configs
     parts = [part for name in layers for part in (configs[name].components(name) if name in configs else (name,))]
-    return tuple(check_layer("layers", name, channels) for name in parts)
+    return tuple(check_layer("layers", name, tiles) for name in parts)
 
 
-def check_layer(argument: str, name: str, channels: SiteChannels) -> str:
+def check_layer(argument: str, name: str, tiles: Tiles) -> str:
     """Return the name of a layer; KeyError if it does not exist."""
-    names = (*LAYERS, *channels.layers)
+    names = all_layers(tiles)
     require(name in names, argument, f"must be one of {', '.join(names)}", repr(name), "check its spelling", KeyError)
     return name
 
 
-def compute_layer(name: str, stored: dict[str, Tensor], clock: Clock, channels: SiteChannels) -> Tensor:
+def compute_layer(name: str, stored: dict[str, Tensor], clock: Clock, tiles: Tiles) -> Tensor:
     """Compute a layer from the stored ones, NaN where unknown."""
-    if name in channels.layers:
-        return channels.compute(name, stored)
+    if name in tiles.levels.layers:
+        return tiles.levels.compute(name, stored, clock)
+    if name in tiles.channels.layers:
+        return tiles.channels.compute(name, stored)
     first, *others = (stored[source] for source in _SOURCES[name])
     if name.endswith("variance"):
         return first + clock.rate * (clock.time - others[0])
@@ -72,13 +78,16 @@ def compute_layer(name: str, stored: dict[str, Tensor], clock: Clock, channels: 
 
 def sources_of(names: Sequence[str], tiles: Tiles) -> list[str]:
     """Return the stored layers that these layers are computed from."""
-    channels = tiles.channels
-    used = {
-        source
-        for name in names
-        for source in (_SOURCES[name] if name in _SOURCES else channels.sources(channels.channel_of(name)))
-    }
+    used = {source for name in names for source in _sources(name, tiles)}
     return [layer for layer in tiles.layers if layer in used]
+
+
+def _sources(name: str, tiles: Tiles) -> tuple[str, ...]:
+    if name in _SOURCES:
+        return _SOURCES[name]
+    if name in tiles.levels.layers:
+        return tiles.levels.sources
+    return tiles.channels.sources(tiles.channels.channel_of(name))
 
 
 def read_area(
@@ -95,7 +104,7 @@ def read_area(
             within = tuple(slice(t.start - s, t.stop - s) for t, s in zip(to, start, strict=True))
             area[:, to[0], to[1]] = tiles.read([tile])[rows, 0, within[0], within[1]].cpu()
     stored = dict(zip(sources, area, strict=True))
-    return {name: compute_layer(name, stored, clock, tiles.channels) for name in names}
+    return {name: compute_layer(name, stored, clock, tiles) for name in names}
 
 
 def _tiles_of(corner: tuple[int, int], size: tuple[int, int]) -> list[tuple[int, int]]:
@@ -124,7 +133,7 @@ def sample_tiles(
     sources = sources_of([name], tiles)
     found = tiles.look_up(locate(i.flatten().long(), j.flatten().long()), sources)
     stored = dict(zip(sources, found, strict=True))
-    values = compute_layer(name, stored, clock, tiles.channels).view(weight.shape)
+    values = compute_layer(name, stored, clock, tiles).view(weight.shape)
     weight = torch.where(values.isnan() | ~finite, 0.0, weight)
-    mean, valid = weighted_mean(values.nan_to_num(nan=0.0), weight)
+    mean, valid = weighted_mean(torch.where(weight > 0, values, 0.0), weight)  # 0 times inf, or NaN, is NaN
     return mean[0].float(), valid[0]

@@ -17,7 +17,9 @@ from torchelev.inputs import checks
 from torchelev.ops.masks import count
 from torchelev.ops.storage import keep_freed_memory
 from torchelev.site.channels import SiteChannels
+from torchelev.site.fill_levels import fill_levels
 from torchelev.site.fusion.align import align
+from torchelev.site.fusion.fuse_levels import Robots, read_robots
 from torchelev.site.fusion.merge import MergeReport, merge_windows
 from torchelev.site.fusion.shares import Change, read_changes
 from torchelev.site.fusion.windows import (
@@ -39,6 +41,7 @@ from torchelev.site.opened_site import OpenedSite
 from torchelev.site.shared.collective import gather_windows, open_shared
 from torchelev.site.shared.ranks import Ranks
 from torchelev.site.site_config import SiteConfig
+from torchelev.site.site_levels import SiteLevels
 from torchelev.site.tiles import LAYERS, locate
 from torchelev.site.times import check_time, continue_time, warn_of_other_clock
 from torchelev.stages.initialize import Remembered
@@ -47,6 +50,8 @@ from torchelev.state import MapState, map_layers
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
     from torch.distributed import ProcessGroup
+
+    from torchelev.levels.config import LevelsConfig
 
 # By map and site: a map's contribution. Of all sites of a process, so that a site may be closed and opened again.
 _contributions: WeakKeyDictionary[ElevationMap, dict[str, Contribution]] = WeakKeyDictionary()
@@ -93,8 +98,8 @@ class SiteMap(OpenedSite):
     Raises:
         ValueError: the resolution is not positive or not that of the site at `path`, or there is something else; the
             group is not initialised, or its ranks open the site differently; or `keyframes` are to be kept by a group,
-            or by a site that was begun without; or `channels` are to be kept beside keyframes or by a group, or are
-            others than those of the site at `path`.
+            or by a site that was begun without; or `channels` or `levels` are to be kept beside keyframes or by a
+            group, or are others than those of the site at `path`.
         ModuleNotFoundError: tensorstore is missing.
     """
 
@@ -108,13 +113,15 @@ class SiteMap(OpenedSite):
         group: ProcessGroup | None = None,
         keyframes: bool = False,
         channels: Mapping[str, Any] | None = None,
+        levels: LevelsConfig | None = None,
     ) -> None:
-        self._ranks, wanted = Ranks(group), SiteChannels(channels, LAYERS)
+        self._ranks, wanted = Ranks(group), (SiteChannels(channels, LAYERS), SiteLevels(levels))
+        wanted[1].require_alone(self._ranks.size == 1 and not keyframes)
         self._ranks.exchange("SiteMap", lambda: {"same": self._set_up(resolution, path, cfg)})
-        self._store = None if path is None else open_shared(self._ranks, "SiteMap", path, self.resolution, wanted)
+        self._store = None if path is None else open_shared(self._ranks, "SiteMap", path, self.resolution, *wanted)
         self._keyframes = KeyframeLog(self._store) if keyframes else None
-        self._begin(device, wanted)
-        self._check_keyframes(keyframes, wanted)
+        self._begin(device, *wanted)
+        self._check_kept(keyframes, *wanted)
         self._agree_on_id()
 
     # Merging --------------------------------------------------------------------------------------------------------
@@ -138,6 +145,8 @@ class SiteMap(OpenedSite):
         the layers `other_elevation`, `other_variance` and `other_time` hold the one that it contradicts. Channels that
         the site keeps are those of its elevation: means by weight, counts of classes added up, the largest of maxima,
         and of "exponential" and "class_average" what was measured last. Maps may lack channels that the site keeps.
+        A site with levels takes all surfaces of maps with levels, and the ground of others; the lowest surface of each
+        cell is its ground.
 
         Args:
             emap: the map, of the site's resolution. The site recognises it, not copies of it.
@@ -179,10 +188,14 @@ class SiteMap(OpenedSite):
         number = self._num_commits + 1
         changes = read_changes(emap, windows, alignment, self._tiles.channels, self.resolution, number)
         shares = {name: change.now for name, change in changes.items()}
-        contribution = snapshot(emap, windows, alignment, state.elapsed, keyframes, shares)
+        robots = self._read_robots(emap, state, windows, alignment)
+        if robots is not None:
+            windows = all_windows = robots.windows
+        stack = None if robots is None else robots.change.now
+        contribution = snapshot(emap, windows, alignment, state.elapsed, keyframes, shares, stack)
         if self._store is None and new is None:  # interrupted, memory may hold a part, which must not count twice
             _contributions.setdefault(emap, {})[self._id] = contribution
-        contradictions = self._fuse(all_windows, all_aligned, now, new, changes)[own]
+        contradictions = self._fuse(all_windows, all_aligned, now, new, changes, robots)[own]
         _contributions.setdefault(emap, {})[self._id] = contribution
         self._raise_interrupted()
         return MergeReport(*alignment, count(windows.is_new), contradictions)
@@ -194,6 +207,15 @@ class SiteMap(OpenedSite):
             return None
         device = contribution.elapsed.device
         return drop_reset(contribution, emap.num_resets.to(device), emap.state.elapsed.to(device))
+
+    def _read_robots(
+        self, emap: ElevationMap, state: MapState, windows: Windows, alignment: Alignment
+    ) -> Robots | None:
+        """Return all surfaces that a map knows; None if the site has no levels."""
+        levels = self._tiles.levels.cfg
+        if levels is None:
+            return None
+        return read_robots(emap, state, windows, alignment, self.resolution, levels.min_gap)
 
     def _bring(self, emap: ElevationMap) -> MapState:
         """Return a map's state on the site's device, without predictions: a site keeps what was measured."""
@@ -245,7 +267,8 @@ class SiteMap(OpenedSite):
     def _align(self, windows: Windows, with_offsets: bool, with_tilt: bool) -> Alignment:
         if not with_offsets:
             return no_alignment(len(windows.known.corner), self._tiles.device)
-        return align(windows, self._read_cells, self.resolution, self.cfg, with_tilt)
+        gap = self._tiles.levels.max_difference
+        return align(windows, self._read_cells, self.resolution, self.cfg, with_tilt, gap)
 
     def _read_cells(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """Return the site's elevation and variance at cells of the lattice, NaN where unknown."""
@@ -260,12 +283,18 @@ class SiteMap(OpenedSite):
         return record(windows, alignment, T_map_base, rows, number, time, self.resolution)
 
     def _fuse(
-        self, windows: Windows, alignment: Alignment, now: float, new: Recorded | None, changes: dict[str, Change]
+        self,
+        windows: Windows,
+        alignment: Alignment,
+        now: float,
+        new: Recorded | None,
+        changes: dict[str, Change],
+        robots: Robots | None,
     ) -> Int[Tensor, "B"]:
         """Fuse windows, or their keyframes, into tiles; return each robot's contradictions."""
         rate, time = self._clock.rate, max(self._time, now)
         if self._keyframes is None or new is None:
-            parts = merge_windows(self._tiles, windows, alignment, self.resolution, rate, self.cfg, changes)
+            parts = merge_windows(self._tiles, windows, alignment, self.resolution, rate, self.cfg, changes, robots)
             return self._write(parts, time, len(windows.known.corner))
         parts = merge_recorded(self._tiles, self._keyframes.rows, new, self.resolution, rate, self.cfg)
         contradictions = self._write(parts if self._store else list(parts), time, len(new.ids), arrays_of(new), 1)
@@ -333,7 +362,10 @@ class SiteMap(OpenedSite):
         contribution = move_contribution(contribution, state.corner, self._time, self.resolution)
         known = self._read_chosen(state, chosen)
         after = fill(state, emap, known, contribution, chosen, self.resolution)
-        _contributions.setdefault(emap, {})[self._id] = add_filled(contribution, state, after, self._clock.rate, chosen)
+        filled = add_filled(contribution, state, after, self._clock.rate, chosen)
+        if self._tiles.levels:
+            filled = fill_levels(emap, state, after, self._tiles, filled, chosen, self._clock, self.resolution)
+        _contributions.setdefault(emap, {})[self._id] = filled
         return map_layers(lambda value: value.to(emap.device), after)
 
     def _read_chosen(self, state: MapState, chosen: Bool[Tensor, "B"]) -> Remembered:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchelev.site.channels import SiteChannels
+from torchelev.site.site_levels import SiteLevels
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -81,10 +82,12 @@ class Tiles:
         capacity: how many stay in memory if there is a storage.
         device: that holds them.
         channels: of the site; None: there are none.
+        levels: of the site; None: there are none.
 
     Attributes:
         channels: of the site.
-        layers: names of the L layers: `LAYERS`, and those of the channels.
+        levels: of the site.
+        layers: names of the L layers: `LAYERS`, and those of channels and levels.
     """
 
     def __init__(
@@ -93,9 +96,11 @@ class Tiles:
         capacity: int,
         device: torch.device | str,
         channels: SiteChannels | None = None,
+        levels: SiteLevels | None = None,
     ) -> None:
         self.channels = SiteChannels(None, LAYERS) if channels is None else channels
-        self.layers = (*LAYERS, *self.channels.stored)
+        self.levels = SiteLevels(None) if levels is None else levels
+        self.layers = (*LAYERS, *self.channels.stored, *self.levels.stored)
         self._storage, self._capacity = storage, capacity
         self._slots: OrderedDict[Tile, int] = OrderedDict()
         self._free: list[int] = []

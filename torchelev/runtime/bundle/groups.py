@@ -15,7 +15,7 @@ from torchelev.observations.scan_layout import scan_layout
 #: of a group: the names of its entries if the robot gives them itself, else what reads the map
 Group = HeightScan | MapImage | Sequence[str]
 
-_REFUSED = ("channels", "channel_fill", "max_clearance")  # settings of what `require_heights` refuses
+_REFUSED = ("channels", "channel_fill")  # settings of what `require_heights` refuses
 _IMAGE_SETTINGS = [field.name for field in dataclasses.fields(MapImage) if field.init and field.name not in _REFUSED]
 
 
@@ -46,19 +46,21 @@ def scan_settings(scan: HeightScan) -> dict[str, Any]:
 
 def image_settings(image: MapImage) -> dict[str, Any]:
     """Return the settings of an image by name, as the C library takes them."""
-    return {name: getattr(image, name) for name in _IMAGE_SETTINGS}
+    settings = {name: getattr(image, name) for name in _IMAGE_SETTINGS}
+    if "clearance" not in image.layers:  # libraries without levels do not know it
+        del settings["max_clearance"]
+    return settings
 
 
 def require_heights(groups: Mapping[str, Group]) -> None:
-    """Refuse groups that read channels or ceilings, which neither recordings nor the C library hold."""
+    """Refuse groups that read channels, or scans of ceilings, which neither recordings nor the C library hold."""
     for name, group in groups.items():
         channels = group.channels if isinstance(group, HeightScan | MapImage) else ()
         rule, hint = "must read no channels, which bundles do not hold", "leave channels out"
         require(not channels, f"groups.{name}.channels", rule, channels, hint)
         reads_ceiling = isinstance(group, HeightScan) and group.surface == "ceiling"
-        reads_ceiling = reads_ceiling or (isinstance(group, MapImage) and "clearance" in group.layers)
-        rule, hint = "must read no ceilings, which bundles do not hold", "leave it out"
-        require(not reads_ceiling, f"groups.{name}", rule, "one of ceilings", hint)
+        rule, hint = "must scan no ceilings, which bundles do not hold", "read the clearance of a MapImage"
+        require(not reads_ceiling, f"groups.{name}", rule, "a scan of ceilings", hint)
 
 
 def from_json(where: str, rows: Any) -> dict[str, Group]:

@@ -76,9 +76,20 @@ constexpr Setting SETTINGS[] = {
     {"traversability.critical_roughness", NUMBER, false, false, {0.05}},
     {"traversability.robot", IGNORED, true, true, {}},
     {"completion", ONLY_PYTHON, true, true, {}},
-    {"levels", ONLY_PYTHON, true, true, {}},
+    {"levels", GROUP, true, true, {}},
+    {"levels.max_levels", INTEGER, false, false, {3}},
+    {"levels.min_gap", NUMBER, false, false, {0.4}},
+    {"levels.separation", CHOICE, false, false, {0}},
+    {"levels.max_step", NUMBER, false, false, {0.3}},
+    {"levels.max_blind", NUMBER, false, false, {0.5}},
+    {"levels.min_support", NUMBER, false, false, {3.0}},
     {"filters", CHAIN, false, false, {}},
     {"channels", ONLY_PYTHON, false, false, {}},
+};
+
+constexpr Choice CHOICES[] = {
+    {"separation", "rays"},
+    {"separation", "gap"},
 };
 
 constexpr Tensor STATE[] = {
@@ -121,6 +132,7 @@ constexpr int CONFIG_VERSION = 1;
 constexpr int MAX_RADIUS = 1000;
 constexpr int MAX_REFINEMENTS = 100;
 constexpr int MAX_CELLS = 16384;
+constexpr int MAX_LEVELS = 8;
 constexpr double MIN_RESOLUTION = 0.0001;
 constexpr double FARTHEST = 1000000000.0;
 constexpr double STEP_REACH = 0.1;

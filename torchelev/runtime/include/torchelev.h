@@ -11,8 +11,9 @@
  * Threads: a map, a scan or an image belongs to one thread at a time; different ones may be used at the same time. What
  * reads a map (layers, samples, statistics) may run on several threads while none updates it.
  *
- * Memory: after a map, a scan or an image is created, updates and reads allocate nothing. A diagnosis does, and so does
- * the first read of a filter's layer after an update.
+ * Memory: after a map, a scan or an image is created, updates and reads allocate nothing. A diagnosis does, and so do
+ * the first read of a filter's layer after an update, and updates of a map with levels that meet more surfaces than those
+ * before.
  */
 #ifndef TORCHELEV_H
 #define TORCHELEV_H
@@ -145,7 +146,7 @@ torchelev_status torchelev_map_corner(const torchelev_map* map, double corner[2]
 
 /**
  * Copy a layer: "elevation", "variance", "validity", "time", "upper_bound", "traversability", "normal_x", "normal_y",
- * "normal_z", or one of the config's filters.
+ * "normal_z", of a map with levels "ceiling" and "clearance" (inf: nothing hangs there), or one of the config's filters.
  *
  * @param values (H, W), NaN where not known.
  * @param size number of values that fit.
@@ -154,7 +155,7 @@ torchelev_status torchelev_map_layer(const torchelev_map* map, const char* name,
 
 /**
  * Return a tensor of the state by its name in Python, such as "elevation" or "validity": its memory, (H, W), which
- * updates overwrite; null, with an error, without such a tensor.
+ * updates overwrite; null, with an error, without such a tensor. Those of levels begin with "levels_", as in a saved map.
  *
  * @param size_bytes written, unless null.
  */

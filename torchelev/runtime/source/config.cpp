@@ -24,7 +24,15 @@ std::string names_in(const std::string& group) {
 }
 
 // Whether a saved map depends on a setting of this kind. On filters it does not: they only read it.
-bool is_of_state(Kind kind) { return kind == GROUP || kind == NUMBER || kind == INTEGER || kind == PLACE; }
+bool is_of_state(Kind kind) { return kind < ONLY_PYTHON; }
+
+// The words of a setting that is one of several.
+std::vector<std::string> words_of(const std::string& name) {
+    std::vector<std::string> words;
+    for (const Choice& choice : CHOICES)
+        if (last_part(name) == choice.setting) words.push_back(choice.word);
+    return words;
+}
 
 void require_known_version(const Json& root, const std::string& where) {
     const Json* version = root.find(VERSION_NAME);
@@ -89,6 +97,7 @@ void Config::read_setting(size_t k, const Json& value) {
         return;
     }
     if (setting.kind == PLACE) return read_place(k, value);
+    if (setting.kind == CHOICE) return read_choice(k, value);
     const bool is_infinite = value.kind == Json::STRING && (value.text == "inf" || value.text == "-inf");
     REQUIRE(value.kind == Json::NUMBER || is_infinite, where, "must be a number", value.describe(),
             "give a number without quotes");
@@ -127,6 +136,18 @@ void Config::read_place(size_t k, const Json& value) {
     for (int axis = 0; axis < 3; axis++) entries[k].values[axis] = value.items[axis].number;
 }
 
+void Config::read_choice(size_t k, const Json& value) {
+    const std::vector<std::string> words = words_of(SETTINGS[k].name);
+    const auto found = std::find(words.begin(), words.end(), value.text);
+    const bool fits = value.kind == Json::STRING && found != words.end();
+    REQUIRE(fits, SETTINGS[k].name, "must be one of " + joined(words), value.describe(), "use " + words[0]);
+    entries[k].values[0] = double(found - words.begin());
+}
+
+std::string Config::word(const std::string& name) const { return words_of(name)[size_t((*this)[name])]; }
+
+bool Config::has_levels() const { return has("levels") && (*this)["levels.max_levels"] > 1; }
+
 int64_t Config::rows() const { return int64_t(std::nearbyint((*this)["grid.length_x"] / (*this)["grid.resolution"])); }
 
 int64_t Config::columns() const {
@@ -143,7 +164,8 @@ std::string Config::canonical() const {
     std::string text;
     for (size_t k = 0; k < NUMBER_OF_SETTINGS; k++) {
         const Entry& entry = entries[k];
-        if (!is_of_state(SETTINGS[k].kind)) continue;
+        const bool is_of_levels = std::string(SETTINGS[k].name).rfind("levels", 0) == 0;
+        if (!is_of_state(SETTINGS[k].kind) || (is_of_levels && !has("levels"))) continue;
         text += SETTINGS[k].name;
         if (entry.is_null) text += " null";
         else if (SETTINGS[k].kind == PLACE)
@@ -168,7 +190,7 @@ void Config::require_at_least(const std::string& name, double least, const std::
 }
 
 void Config::check() const {
-    check_grid(), check_sensor(), check_drift(), check_fusion(), check_rays(), check_surface();
+    check_grid(), check_sensor(), check_drift(), check_fusion(), check_rays(), check_surface(), check_levels();
 }
 
 void Config::check_grid() const {
@@ -259,6 +281,19 @@ void Config::check_rays() const {
         require_at_least("overlap.max_base_height", cfg["overlap.base_height"], "must be at least overlap.base_height",
                          "give the highest base of your robots [m]");
     }
+}
+
+void Config::check_levels() const {
+    const Config& cfg = *this;
+    if (!has("levels")) return;
+    require_rule(1 <= cfg["levels.max_levels"] && cfg["levels.max_levels"] <= MAX_LEVELS, "levels.max_levels",
+                 "must be a whole number from 1 to " + std::to_string(MAX_LEVELS),
+                 "3 hold ground, table and ceiling; each more costs time and 20 bytes a cell");
+    for (const char* name : {"levels.min_gap", "levels.max_step"})
+        require_rule(cfg[name] > 0 && std::isfinite(cfg[name]), name, "must be a positive number", "give metres");
+    for (const char* name : {"levels.max_blind", "levels.min_support"})
+        require_rule(0 <= cfg[name] && std::isfinite(cfg[name]), name, "must be finite and not negative",
+                     "leave it out for the default");
 }
 
 void Config::check_surface() const {

@@ -38,6 +38,7 @@ class Config {
     void read_setting(size_t k, const Json& value);
     void read_group_setting(size_t k, const Json& value);
     void read_place(size_t k, const Json& value);
+    void read_choice(size_t k, const Json& value);
     void check() const;
     void check_grid() const;
     void check_sensor() const;
@@ -45,6 +46,7 @@ class Config {
     void check_fusion() const;
     void check_rays() const;
     void check_surface() const;
+    void check_levels() const;
     void require_rule(bool holds, const std::string& name, const std::string& rule, const std::string& hint) const;
     void require_at_least(const std::string& name, double least, const std::string& rule,
                           const std::string& hint) const;
@@ -59,6 +61,8 @@ class Config {
     bool has(const std::string& name) const { return !entries[find(name)].is_null; }
     double operator[](const std::string& name) const { return entries[find(name)].values[0]; }
     const double* place(const std::string& name) const { return entries[find(name)].values; }
+    std::string word(const std::string& name) const;  // of a CHOICE
+    bool has_levels() const;                          // surfaces besides the ground
     int64_t rows() const;
     int64_t columns() const;
     // The least traversability of cells that measure the drift: `drift_gate`.

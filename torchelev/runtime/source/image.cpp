@@ -10,9 +10,10 @@
 namespace {
 
 const std::initializer_list<const char*> KEYS = {"length_x", "length_y",  "resolution", "offset",
-                                                 "layers",   "alignment", "mode",       "nominal_height"};
+                                                 "layers",   "alignment", "mode",       "nominal_height",
+                                                 "max_clearance"};
 const std::initializer_list<const char*> CHANNELS = {"elevation", "validity", "variance", "upper_bound",
-                                                     "traversability"};
+                                                     "traversability", "clearance"};
 
 constexpr int64_t MOST_PIXELS = 1 << 24;
 
@@ -25,7 +26,7 @@ int64_t pixels_along(const Layout& layout, const char* key, double resolution) {
     return int64_t(whole);
 }
 
-std::vector<std::string> channels_of(const Layout& layout) {
+std::vector<std::string> channels_of(const Layout& layout, bool has_levels) {
     const Json& layers = layout["layers"];
     if (layers.kind == Json::NUL) return {"elevation", "validity", "upper_bound", "traversability"};
     std::vector<std::string> names;
@@ -34,13 +35,15 @@ std::vector<std::string> channels_of(const Layout& layout) {
         REQUIRE(!is_completed, "image.layers", "needs Python: this library has no completion", "'" + layer.text + "'",
                 "leave it out", TORCHELEV_UNSUPPORTED);
         place_of("image.layers", layer.text, CHANNELS);
+        REQUIRE(layer.text != "clearance" || has_levels, "image.layers", "needs a map with levels, which knows ceilings",
+                "'clearance'", "give the map levels, or leave it out");
         const bool is_new = std::find(names.begin(), names.end(), layer.text) == names.end();
         REQUIRE(is_new, "image.layers", "must name each channel once", "'" + layer.text + "' twice", "leave one out",
                 TORCHELEV_UNSUPPORTED);
         names.push_back(layer.text);
     }
     REQUIRE(!names.empty(), "image.layers",
-            "must be some of elevation, validity, variance, upper_bound, traversability", layers.describe(),
+            "must be some of " + joined(CHANNELS), layers.describe(),
             "correct their names");
     return names;
 }
@@ -70,9 +73,11 @@ torchelev_image::torchelev_image(const torchelev_map& map, const std::string& te
     settings.alignment = layout.choice("alignment", "yaw", {"yaw", "base", "world"});
     settings.mode = layout.choice("mode", "bilinear", {"bilinear", "nearest", "minimum"});
     settings.nominal_height = float(layout.number("nominal_height", 0));
+    max_clearance = float(layout.number("max_clearance", 3));
+    REQUIRE(max_clearance > 0, "max_clearance", "must be a positive number", repr(max_clearance), "give metres");
     Span(xy, settings.alignment, 0).require_inside(map.cfg);
     pattern.assign(xy.begin(), xy.end());
-    const std::vector<std::string> channels = channels_of(layout);
+    const std::vector<std::string> channels = channels_of(layout, map.levels != nullptr);
     settings.pattern = pattern.data(), settings.resolution = map.resolution();
     settings.B = 1, settings.P = shape[1] * shape[2], settings.channels = shape[0] = int64_t(channels.size());
     settings.height = map.sizes.H, settings.width = map.sizes.W;
@@ -95,8 +100,9 @@ void torchelev_image::add_sources(const torchelev_map& map, const std::vector<st
     };
     add(VARIANCE, place("variance"), -1, false);
     add(TRAVERSABILITY, place("traversability"), -1, false);
+    add(CLEARANCE, place("clearance"), -1, false);
     values.resize(map.cells() * sources.size()),
-        known.resize(values.size());  // of these two; the others are the state's
+        known.resize(values.size());  // of these; the others are the state's
     add(ELEVATION, place("elevation"), place("validity"), true);
     add(UPPER_BOUND, place("upper_bound"), -1, true);
 }
@@ -115,7 +121,8 @@ void torchelev_image::look_at(const torchelev_map& map, size_t k) {
     uint8_t* flags = &known[map.cells() * k];
     for (int64_t cell = 0; cell < map.cells(); cell++) {
         const CellValue found = map.read(layers[k], cell);
-        to[cell] = found.value, flags[cell] = found.known;
+        to[cell] = layers[k] == CLEARANCE ? std::min(found.value, max_clearance) : found.value;
+        flags[cell] = found.known;
     }
     source.values = to, source.known = flags;
 }

@@ -22,6 +22,7 @@ struct torchelev_image {
     std::vector<float> pattern;  // (P, 2) [m]
     std::vector<float> values;   // of the layers that are computed, one after the other
     std::vector<uint8_t> known;
+    float max_clearance = 0;  // [m]
     std::unique_ptr<images::Pixels> pixels;
 
     void add_sources(const torchelev_map& map, const std::vector<std::string>& channels);

@@ -34,6 +34,9 @@ class Layout {
             const bool is_of_channels = key == "channels" || key == "channel_fill";
             REQUIRE(!is_of_channels, named(key), "needs Python: this library has no channels", value.describe(),
                     "leave it out", TORCHELEV_UNSUPPORTED);
+            const bool is_of_ceilings = key == "surface" || key == "no_ceiling";
+            REQUIRE(!is_of_ceilings, named(key), "needs Python: this library scans no ceilings", value.describe(),
+                    "read an image's clearance, or leave it out", TORCHELEV_UNSUPPORTED);
             place_of(named(key), key, keys);
         }
     }

@@ -10,8 +10,14 @@
 
 namespace {
 
-const char* const LAYERS[] = {"elevation",      "variance", "validity", "time",    "upper_bound",
-                              "traversability", "normal_x", "normal_y", "normal_z"};
+// In the order of `Layer`.
+const char* const LAYERS[] = {"elevation", "variance", "validity", "time",    "upper_bound", "traversability",
+                              "normal_x",  "normal_y", "normal_z", "ceiling", "clearance"};
+
+// The layers that a map has.
+std::vector<std::string> layers_of(const Config& cfg) {
+    return {std::begin(LAYERS), cfg.has_levels() ? std::end(LAYERS) : LAYERS + CEILING};
+}
 
 constexpr torchelev_limits USUAL{131072, 4, 1};
 
@@ -57,7 +63,7 @@ float normal_component(float gx, float gy, int axis) {
 torchelev_map::torchelev_map(const std::string& text, const std::string& where, const torchelev_limits* given)
     : cfg(text, where), settings(settings_of(cfg)), sizes{}, limits(checked_limits(given)),
       filters(cfg.filters.items, {cfg.rows(), cfg.columns(), settings.measure.resolution},
-              {std::begin(LAYERS), std::end(LAYERS)}) {
+              layers_of(cfg)) {
     sizes.B = 1, sizes.H = cfg.rows(), sizes.W = cfg.columns();
     void* addresses[NUMBER_OF_TENSORS];
     for (size_t k = 0; k < NUMBER_OF_TENSORS; k++) {
@@ -66,6 +72,15 @@ torchelev_map::torchelev_map(const std::string& text, const std::string& where, 
     }
     static_assert(sizeof(MapState) == sizeof addresses && std::size(STATE) == NUMBER_OF_TENSORS);
     std::memcpy(static_cast<void*>(&state), addresses, sizeof state);
+    for (size_t k = 0; k < NUMBER_OF_TENSORS; k++) {
+        std::vector<int64_t> shape;
+        for (const int64_t size : STATE[k].shape)
+            if (size) shape.push_back(size == ROWS ? sizes.H : size == COLUMNS ? sizes.W : size);
+        stored.push_back({STATE[k].name, STATE[k].dtype, shape, addresses[k], STATE[k].size, false});
+    }
+    if (cfg.has_levels()) levels = std::make_unique<MapLevels>(cfg, limits);
+    if (levels)
+        for (const Stored& tensor : levels->stored()) stored.push_back(tensor);
     covariance.resize(36 * limits.max_sensors);
     if (!cfg.body.links.empty()) on_robot.resize(limits.max_points);
     history.resize(limits);
@@ -82,15 +97,16 @@ int64_t torchelev_map::count(size_t k) const {
     return count;
 }
 
-size_t torchelev_map::find(const std::string& name) const {
-    size_t k = 0;
-    while (k < NUMBER_OF_TENSORS && name != STATE[k].name) k++;
-    return k;
+const Stored& torchelev_map::find(const std::string& name) const {
+    const auto found = std::find_if(stored.begin(), stored.end(), [&](const Stored& one) { return name == one.name; });
+    REQUIRE(found != stored.end(), "name", "must be a tensor of MapState", "'" + name + "'", "use elevation");
+    return *found;
 }
 
 void torchelev_map::forget() {
     for (size_t k = 0; k < NUMBER_OF_TENSORS; k++) fill_tensor(STATE[k], tensors[k].get(), count(k));
     state.corner[0] = -(sizes.H / 2), state.corner[1] = -(sizes.W / 2);
+    if (levels) levels->forget();
     history.forget(), filters.forget();
 }
 
@@ -121,7 +137,7 @@ void torchelev_map::warm_up() {
             }
             const torchelev_input input{sensors, N,   points.data(),   poses.data(),      T,
                                         nullptr, 0.1, variance.data(), covariances.data()};
-            run(input, ORDER, std::size(ORDER));
+            run_update(input);
         }
     settings = usual;
 }
@@ -196,7 +212,7 @@ void torchelev_map::update(const torchelev_input& input) {
     check(input);
     if (input.pose_covariance) require_covariances(input.pose_covariance, input.num_sensors);
     const double last_correction = *state.statistics.drift_correction;
-    run(input, ORDER, std::size(ORDER));
+    run_update(input);
     history.add(input, input.T_base_links ? on_robot.data() : nullptr, last_correction);
 }
 
@@ -231,13 +247,12 @@ void torchelev_map::find_own(const torchelev_input& input) {
     }
 }
 
-void torchelev_map::run(const torchelev_input& input, const Stage* stages, int64_t number) {
-    float dt = float(input.dt);
+Inputs torchelev_map::inputs_of(const torchelev_input& input, float& dt) {
     Inputs inputs{};
     inputs.points = const_cast<float*>(input.points), inputs.variance = const_cast<float*>(input.variance);
     inputs.T_map_sensor = const_cast<double*>(input.T_map_sensor);
     inputs.T_map_base = const_cast<double*>(input.T_map_base);
-    inputs.dt = &dt;
+    dt = float(input.dt), inputs.dt = &dt;
     if (input.pose_covariance) {
         std::copy_n(input.pose_covariance, 36 * input.num_sensors, covariance.begin());
         inputs.pose_covariance = covariance.data();
@@ -249,20 +264,41 @@ void torchelev_map::run(const torchelev_input& input, const Stage* stages, int64
     sizes.K = input.T_base_links ? int64_t(cfg.body.links.size()) : 0;
     sizes.S = input.num_sensors, sizes.N = input.num_points, sizes.M = sizes.S * sizes.N;
     sizes.P = sizes.S > 1 ? sizes.S : 0;
-    Update one{settings, sizes, state, inputs, own.measurement, own.memory, limits.num_threads};
+    return inputs;
+}
+
+void torchelev_map::run(const torchelev_input& input, const Stage* stages, int64_t number) {
+    float dt;
+    Update one{settings, sizes, state, inputs_of(input, dt), own.measurement, own.memory, limits.num_threads};
     filters.forget();
     run_stages(one, stages, number);
+}
+
+// All stages, in whose middle levels take the points of other surfaces out: `update` of elevation_map.py.
+void torchelev_map::run_update(const torchelev_input& input) {
+    if (!levels) return run(input, ORDER, std::size(ORDER));
+    torchelev_input window = input;
+    window.num_points = 0, window.variance = nullptr, window.T_base_links = nullptr;
+    const Stage follow[] = {run_measure, run_recenter};
+    run(window, follow, std::size(follow));
+    float dt;
+    Inputs inputs = inputs_of(input, dt);
+    levels->sort_points(state, sizes, inputs, limits.num_threads);
+    Update one{settings, sizes, state, inputs, own.measurement, own.memory, limits.num_threads};
+    run_stages(one, ORDER, std::size(ORDER));
+    if (settings.compensate.has_drift) levels->raise(*state.statistics.drift_correction);
 }
 
 // Reading ------------------------------------------------------------------------------------------------------------
 
 LayerView torchelev_map::view(const std::string& name) const {
+    const char* const* const last = levels ? std::end(LAYERS) : LAYERS + CEILING;
     const auto own = [&](const std::string& layer) {
-        return LayerView{*this, Layer(std::find(std::begin(LAYERS), std::end(LAYERS), layer) - LAYERS), nullptr};
+        return LayerView{*this, Layer(std::find(std::begin(LAYERS), last, layer) - LAYERS), nullptr};
     };
-    if (const LayerView found = own(name); found.layer < Layer(std::size(LAYERS))) return found;
-    REQUIRE(filters.has(name), "layer", "must be one of " + joined(LAYERS) + filters.listed(), "'" + name + "'",
-            "use elevation");
+    if (const LayerView found = own(name); LAYERS + found.layer < last) return found;
+    REQUIRE(filters.has(name), "layer", "must be one of " + joined(layers_of(cfg)) + filters.listed(),
+            "'" + name + "'", "use elevation");
     const std::lock_guard<std::mutex> lock(filtering);
     const Cells& made = filters.read(name, [&](const std::string& layer, Cells& to) {
         for (int64_t k = 0; k < cells(); k++) {
@@ -300,6 +336,12 @@ CellValue torchelev_map::read(Layer layer, int64_t k) const {
             return {known ? s.elevation[k] : s.upper_bound[k], known || s.bounded[k]};
         case TRAVERSABILITY:
             return {s.traversability[k], known && s.rated[k]};
+        case CEILING:
+        case CLEARANCE: {
+            const Ceiling found = levels->ceiling(s, k);
+            if (layer == CEILING) return {found.height, found.known};
+            return {found.height - s.elevation[k], found.known && known};
+        }
         default:
             return {normal_component(gx, gy, layer - NORMAL_X), known && s.has_normal[k]};
     }

@@ -9,11 +9,15 @@
 #include "runtime/source/config.h"
 #include "runtime/source/diagnosis/history.h"
 #include "runtime/source/filters/chain.h"
+#include "runtime/source/levels.h"
 #include "tables.h"
 
 constexpr size_t NUMBER_OF_TENSORS = sizeof(MapState) / sizeof(void*);
 
-enum Layer { ELEVATION, VARIANCE, VALIDITY, TIME, UPPER_BOUND, TRAVERSABILITY, NORMAL_X, NORMAL_Y, NORMAL_Z };
+enum Layer {
+    ELEVATION, VARIANCE, VALIDITY, TIME, UPPER_BOUND, TRAVERSABILITY, NORMAL_X, NORMAL_Y, NORMAL_Z,
+    CEILING, CLEARANCE  // of a map with levels
+};
 
 // A value and whether it is known.
 struct CellValue {
@@ -40,6 +44,8 @@ struct torchelev_map {
     Own own;
     std::vector<std::unique_ptr<unsigned char[]>> tensors;  // in the order of STATE
     MapState state;                                         // their addresses
+    std::unique_ptr<MapLevels> levels;                      // null without other surfaces than the ground
+    std::vector<Stored> stored;                             // all tensors, those of the levels last
     std::vector<float> covariance;                          // (S, 6, 6) of the input
     std::vector<uint8_t> on_robot;                          // (S, N) of the input, with shapes of links
     robot_body::Posed posed;
@@ -54,8 +60,8 @@ struct torchelev_map {
     double resolution() const { return settings.measure.resolution; }
     int64_t count(size_t k) const;  // of a tensor's elements
     size_t bytes(size_t k) const { return count(k) * STATE[k].size; }
-    size_t find(const std::string& name) const;  // a tensor; NUMBER_OF_TENSORS without it
-    void forget();                               // make the map blank
+    const Stored& find(const std::string& name) const;  // a tensor; raises Error
+    void forget();                                      // make the map blank
     void update(const torchelev_input& input);
     void move(const double* T_map_base);
     void initialize(const double* feet, int64_t number, const std::string& method);
@@ -71,6 +77,8 @@ struct torchelev_map {
     void check(const torchelev_input& input) const;
     void find_own(const torchelev_input& input);
     void run(const torchelev_input& input, const Stage* stages, int64_t number);
+    void run_update(const torchelev_input& input);
+    Inputs inputs_of(const torchelev_input& input, float& dt);
     void warm_up();
     template <class Change>
     void revise(const Change& change);

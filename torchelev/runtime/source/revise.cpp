@@ -126,6 +126,7 @@ void torchelev_map::clear_around(double x, double y, double radius) {
 
 // Make a cell as one that was never known.
 void torchelev_map::blank(int64_t cell) {
+    if (levels) levels->forget_cell(state, cell);
     for (size_t k = 0; k < NUMBER_OF_TENSORS; k++) {
         if (STATE[k].shape[0] != ROWS) continue;
         unsigned char* const layer = tensors[k].get();

@@ -102,7 +102,7 @@ void set_middle(int64_t size, double radius, int32_t& first, int32_t& end) {
 
 void set_overlap(const Config& cfg, OverlapSettings& s) {
     const double radius = cfg["overlap.radius"] / cfg["grid.resolution"];
-    s.has_overlap = cfg.has("overlap"), s.resolution = float(cfg["grid.resolution"]);
+    s.has_overlap = cfg.has("overlap") && !cfg.has_levels(), s.resolution = float(cfg["grid.resolution"]);
     s.radius_square = float(square(cfg["overlap.radius"]));
     s.slope = float(cfg["overlap.height"] / cfg["overlap.radius"]), s.height = float(cfg["overlap.height"]);
     s.base_height = float(cfg["overlap.base_height"]), s.max_base_height = float(cfg["overlap.max_base_height"]);

@@ -35,10 +35,9 @@ std::string quoted(const std::string& text) {
     return out + "\"";
 }
 
-std::string shape_of(const torchelev_map& map, size_t k) {
+std::string shape_of(const Stored& tensor) {
     std::string text = "[1";
-    for (const int64_t size : STATE[k].shape)
-        if (size) text += "," + std::to_string(size == ROWS ? map.sizes.H : size == COLUMNS ? map.sizes.W : size);
+    for (const int64_t size : tensor.shape) text += "," + std::to_string(size);
     return text + "]";
 }
 
@@ -47,10 +46,10 @@ std::string header_of(const torchelev_map& map) {
     std::string text = "{\"__metadata__\":{\"format\":" + quoted(FORMAT) + ",\"version\":" + quoted(VERSION) +
                        ",\"config\":" + quoted(map.cfg.canonical()) + "}";
     size_t at = 0;
-    for (size_t k = 0; k < NUMBER_OF_TENSORS; k++) {
-        const size_t end = at + map.bytes(k);
-        text += "," + quoted(STATE[k].name) + ":{\"dtype\":" + quoted(STATE[k].dtype) +
-                ",\"shape\":" + shape_of(map, k) + ",\"data_offsets\":[" + std::to_string(at) + "," +
+    for (const Stored& tensor : map.stored) {
+        const size_t end = at + tensor.bytes();
+        text += "," + quoted(tensor.name) + ":{\"dtype\":" + quoted(tensor.dtype) +
+                ",\"shape\":" + shape_of(tensor) + ",\"data_offsets\":[" + std::to_string(at) + "," +
                 std::to_string(end) + "]}";
         at = end;
     }
@@ -77,21 +76,21 @@ void write_all(const torchelev_map& map, std::FILE* file, const std::string& pat
     unsigned char bytes[8];
     for (int k = 0; k < 8; k++) bytes[k] = static_cast<unsigned char>(length >> (8 * k));
     bool fits = std::fwrite(bytes, 1, 8, file) == 8 && std::fwrite(header.data(), 1, length, file) == length;
-    for (size_t k = 0; fits && k < NUMBER_OF_TENSORS; k++)
-        fits = std::fwrite(map.tensors[k].get(), 1, map.bytes(k), file) == map.bytes(k);
+    for (const Stored& tensor : map.stored)
+        fits = fits && std::fwrite(tensor.data, 1, tensor.bytes(), file) == tensor.bytes();
     if (!fits || std::fflush(file) != 0)
         refuse_file(path, std::string("cannot be written (") + std::strerror(errno) + ")");
 }
 
 // A tensor of a file whose values no update would leave behind.
-bool is_sound(const Tensor& tensor, const unsigned char* values, int64_t count) {
+bool is_sound(const Stored& tensor, const unsigned char* values) {
     const std::string dtype = tensor.dtype;
-    for (int64_t k = 0; k < count; k++) {
+    for (int64_t k = 0; k < tensor.count(); k++) {
         float value;
         if (dtype == "BOOL" && values[k] > 1) return false;
         if (dtype != "F32") continue;
         std::memcpy(&value, values + 4 * k, 4);
-        if (!std::isfinite(value)) return false;
+        if (!std::isfinite(value) && !(tensor.has_infinities && value == -INFINITY)) return false;
     }
     return true;
 }
@@ -99,13 +98,14 @@ bool is_sound(const Tensor& tensor, const unsigned char* values, int64_t count) 
 // Whether the window lies where poses may be, and the clock has not run for ever.
 bool has_sound_place(const torchelev_map& map, const unsigned char* data) {
     const double farthest = 1.1 * double(map.settings.measure.farthest) / map.resolution();
-    for (size_t k = 0; k < NUMBER_OF_TENSORS; data += map.bytes(k++)) {
+    for (size_t k = 0; k < map.stored.size(); data += map.stored[k++].bytes()) {
         int64_t numbers[2] = {};
-        const std::string name = STATE[k].name;
-        if (name != "corner" && name != "elapsed") continue;
-        std::memcpy(numbers, data, map.bytes(k));
+        const std::string name = map.stored[k].name;
+        const bool is_corner = name == "corner" || name == "levels_corner";
+        if (!is_corner && name != "elapsed") continue;
+        std::memcpy(numbers, data, map.stored[k].bytes());
         const bool is_far = std::fabs(double(numbers[0])) > farthest || std::fabs(double(numbers[1])) > farthest;
-        if (name == "corner" ? is_far : numbers[0] < 0 || numbers[0] > INT64_MAX / 2) return false;
+        if (is_corner ? is_far : numbers[0] < 0 || numbers[0] > INT64_MAX / 2) return false;
     }
     return true;
 }
@@ -164,16 +164,17 @@ void load_state(torchelev_map& map, const std::string& path) {
     // With the same config, the header of a whole file is the one that this map would write.
     if (text.substr(8, length) != header_of(map)) refuse_file(path, "damaged: its header does not describe a map");
     size_t at = 8 + length, end = at;
-    for (size_t k = 0; k < NUMBER_OF_TENSORS; k++) end += map.bytes(k);
+    for (const Stored& tensor : map.stored) end += tensor.bytes();
     if (text.size() != end)
         refuse_file(path, "damaged: " + std::to_string(text.size()) + " bytes instead of " + std::to_string(end));
     const auto* bytes = reinterpret_cast<const unsigned char*>(text.data());
-    for (size_t k = 0; k < NUMBER_OF_TENSORS; at += map.bytes(k++))
-        if (!is_sound(STATE[k], bytes + at, map.count(k)))
-            refuse_file(path, std::string("damaged: ") + STATE[k].name + " holds what no update leaves");
+    for (const Stored& tensor : map.stored) {
+        if (!is_sound(tensor, bytes + at))
+            refuse_file(path, std::string("damaged: ") + tensor.name + " holds what no update leaves");
+        at += tensor.bytes();
+    }
     at = 8 + length;
     if (!has_sound_place(map, bytes + at)) refuse_file(path, "damaged: its window or its clock cannot be");
-    for (size_t k = 0; k < NUMBER_OF_TENSORS; at += map.bytes(k++))
-        std::memcpy(map.tensors[k].get(), bytes + at, map.bytes(k));
+    for (const Stored& tensor : map.stored) std::memcpy(tensor.data, bytes + at, tensor.bytes()), at += tensor.bytes();
     map.history.forget(), map.filters.forget();
 }

@@ -9,14 +9,20 @@
 #include "kernels/update.h"
 #include "observations/kernel/scan.h"
 
-// GROUP: an object of settings. ONLY_PYTHON: what this library cannot do. IGNORED: what no update reads. CHAIN: filters.
-enum Kind { GROUP, NUMBER, INTEGER, PLACE, ONLY_PYTHON, IGNORED, CHAIN };
+// GROUP: an object of settings. CHOICE: one of several words. ONLY_PYTHON: what this library cannot do. IGNORED: what no
+// update reads. CHAIN: filters.
+enum Kind { GROUP, NUMBER, INTEGER, PLACE, CHOICE, ONLY_PYTHON, IGNORED, CHAIN };
 
 struct Setting {
     const char* name;  // with its groups, as "fusion.edges.margin"
     Kind kind;
     bool is_nullable, is_null;
     double values[3];  // by default
+};
+
+// A word of a setting that is one of several; the setting's value is its place among them.
+struct Choice {
+    const char *setting, *word;
 };
 
 // A setting of a filter; NAN by default: none.

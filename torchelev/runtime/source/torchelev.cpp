@@ -178,11 +178,9 @@ const void* torchelev_map_tensor(const torchelev_map* map, const char* name, siz
     const void* found = nullptr;
     status_of([&] {
         const torchelev_map& m = given("map", map);
-        const size_t k = m.find(&given("name", name));
-        REQUIRE(k < NUMBER_OF_TENSORS, "name", "must be a tensor of MapState", std::string("'") + name + "'",
-                "use elevation");
-        if (size_bytes) *size_bytes = m.bytes(k);
-        found = m.tensors[k].get();
+        const Stored& tensor = m.find(&given("name", name));
+        if (size_bytes) *size_bytes = tensor.bytes();
+        found = tensor.data;
     });
     return found;
 }

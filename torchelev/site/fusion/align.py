@@ -36,7 +36,14 @@ class Pairs(NamedTuple):
 ReadSite = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]  # cell numbers x, y (K,) -> elevation, variance (K,)
 
 
-def align(windows: Windows, read_site: ReadSite, resolution: float, cfg: SiteConfig, with_tilt: bool) -> Alignment:
+def align(
+    windows: Windows,
+    read_site: ReadSite,
+    resolution: float,
+    cfg: SiteConfig,
+    with_tilt: bool,
+    max_difference: float = math.inf,
+) -> Alignment:
     """Find the offsets by robust least squares over all pairs of overlapping windows, and of windows and the site.
 
     Minimises the sum of rho((h_a - o_a) - (h_b - o_b)) over the cells that are flat and certain in both, with o = 0 for
@@ -49,9 +56,10 @@ def align(windows: Windows, read_site: ReadSite, resolution: float, cfg: SiteCon
         resolution: [m].
         cfg: settings.
         with_tilt: also find how the windows tilt.
+        max_difference: [m] beyond which heights, less the last offsets, are those of different levels.
     """
     B = len(windows.known.corner)
-    pairs = find_pairs(windows, read_site, resolution, cfg)
+    pairs = find_pairs(windows, read_site, resolution, cfg, max_difference)
     count = torch.bincount(pairs.first * (B + 1) + pairs.second, minlength=(B + 1) ** 2).view(B + 1, B + 1)
     overlap = count + count.T >= cfg.min_overlap
     pairs = Pairs(*(value[overlap[pairs.first, pairs.second]] for value in pairs))
@@ -69,8 +77,10 @@ def _known_offsets(windows: Windows) -> Float[Tensor, "B"]:
     return torch.where(contribution.known.is_known.flatten(1).any(1), contribution.alignment.offset, torch.nan)
 
 
-def find_pairs(windows: Windows, read_site: ReadSite, resolution: float, cfg: SiteConfig) -> Pairs:
-    """Return the pairs of heights to compare, of cells that are flat and certain."""
+def find_pairs(
+    windows: Windows, read_site: ReadSite, resolution: float, cfg: SiteConfig, max_difference: float = math.inf
+) -> Pairs:
+    """Return the pairs of heights to compare, of cells that are flat and certain; arguments as of `align`."""
     window, x, y, height, variance = _comparable(windows, cfg)
     half = torch.tensor(windows.known.elevation.shape[1:], device=x.device) / 2 - 0.5
     position = (torch.stack([x, y], -1) - windows.known.corner[window] - half) * resolution
@@ -88,7 +98,13 @@ def find_pairs(windows: Windows, read_site: ReadSite, resolution: float, cfg: Si
         if apart * len(cell) > _MAX_PAIRS:
             break
     first, second, difference, total, a, b = (torch.cat(column) for column in zip(*found, strict=True))
-    return Pairs(first, second, difference.double(), total.double(), torch.stack([position[a], position[b]], 1))
+    pairs = Pairs(first, second, difference.double(), total.double(), torch.stack([position[a], position[b]], 1))
+    if max_difference == math.inf:
+        return pairs
+    before = _known_offsets(windows).nan_to_num(nan=0.0)
+    offset = torch.cat([before, before.new_zeros(1)])
+    same = (pairs.difference - (offset[first] - offset[second])).abs() <= max_difference
+    return Pairs(*(value[same] for value in pairs))
 
 
 def _comparable(windows: Windows, cfg: SiteConfig) -> tuple[Tensor, ...]:

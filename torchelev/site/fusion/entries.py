@@ -1,16 +1,22 @@
-"""The heights that windows have for cells, in the site's frame."""
+"""The heights that windows have for cells, in the site's frame, and their fusion into tiles."""
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from torchelev.site.fusion.fuse import Entries, Heights
+from torchelev.site.fusion.fuse import Entries, Heights, fuse
 from torchelev.site.fusion.windows import Alignment, Contribution, Known, Windows
+from torchelev.site.site_config import SiteConfig
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
 
 _WITHIN_CELL = 1 / 12  # variance of a position that is uniform in a cell of size 1
 _STEEPEST = 1.0  # slope taken where the known neighbours of a cell span no plane
-_MIN_VARIANCE = 1e-10  # [m^2]
+MIN_VARIANCE = 1e-10  # [m^2]
 
 
 def read_entries(
@@ -54,7 +60,7 @@ def read_heights(known: Known, alignment: Alignment, robot: Tensor, place: Tenso
     """Return a window's heights in the site's frame, (K,) each."""
     elevation, variance, age = (layer.view(-1).index_select(0, place).float() for layer in known[1:4])
     elevation = elevation - rise(known, alignment, robot, place, resolution)
-    variance = (variance - known.rate.float().index_select(0, robot) * age).clamp(min=_MIN_VARIANCE)
+    variance = (variance - known.rate.float().index_select(0, robot) * age).clamp(min=MIN_VARIANCE)
     return Heights(elevation, variance, (known.now.index_select(0, robot) - age).float())
 
 
@@ -70,3 +76,11 @@ def _read_contribution(
     elevation, variance, time = read_heights(contribution.known, contribution.alignment, robot, place, resolution)
     counts = inside & contribution.known.is_known.view(-1).index_select(0, place)
     return Heights(elevation, variance, torch.where(counts, time, torch.nan))
+
+
+def fuse_entries(layers: Float[Tensor, "L C"], entries: Entries, rate: float, cfg: SiteConfig) -> Bool[Tensor, "K"]:
+    """Fuse entries into the layers of tiles, in place; return which contradict other heights of their cells."""
+    fused = fuse(Heights(*layers[0:3]), Heights(*layers[4:7]), entries, rate, cfg)
+    for row, value in zip((0, 1, 2, 4, 5, 6), (*fused.first, *fused.other), strict=True):
+        layers[row] = value
+    return fused.is_contradicted

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from torchelev.ops.parallel import map_in_order
-from torchelev.site.fusion.entries import read_entries, rise
-from torchelev.site.fusion.fuse import Entries, Heights, fuse
+from torchelev.site.fusion.entries import fuse_entries, read_entries, rise
+from torchelev.site.fusion.fuse_levels import Robots, fuse_levels
 from torchelev.site.fusion.fuse_shares import fuse_channels
 from torchelev.site.fusion.pieces import Group, Pieces, group_tiles
 from torchelev.site.fusion.shares import Change
@@ -51,6 +51,7 @@ def merge_windows(
     rate: float,
     cfg: SiteConfig,
     changes: Mapping[str, Change] = MappingProxyType({}),
+    robots: Robots | None = None,
 ) -> Iterator[Merged]:
     """Return the tiles that the windows touch after fusion, a group at a time; changes none in memory.
 
@@ -62,8 +63,11 @@ def merge_windows(
         rate: [m^2/s] at which variances grow.
         cfg: settings.
         changes: of the channels that the robots know.
+        robots: all surfaces of the same robots, whose `windows` these are; None: of a site without levels.
     """
     touched = windows.is_new | windows.is_bounded
+    if robots is not None:
+        touched = touched | robots.change.is_touched
     for change in changes.values():
         touched = touched | change.is_new
     groups = group_tiles(windows.known.corner, touched)
@@ -75,22 +79,17 @@ def merge_windows(
         before = layers[_ELEVATION].clone() if tiles.channels else layers[_ELEVATION]
         robot, cell, place = pieces.select(windows.is_new)
         entries = read_entries(windows, alignment, robot, cell, place, resolution)
-        is_contradicted = fuse_entries(layers, entries, rate, cfg)
+        if robots is None:
+            robot = robot[fuse_entries(layers, entries, rate, cfg)]
+        else:
+            robot = fuse_levels(layers, entries, robot, place, tiles, robots, pieces, rate, cfg)
         lower_bounds(layers, *_read_bounds(windows, alignment, pieces, resolution))
         fuse_channels(layers, before, layers[_ELEVATION], tiles, pieces, changes)
-        contradictions = torch.bincount(robot[is_contradicted], minlength=len(alignment.offset))
+        contradictions = torch.bincount(robot, minlength=len(alignment.offset))
         return Merged(pieces.tiles, values, contradictions)
 
     work = ((group, tiles.read(group.tiles)) for group in groups)
     return map_in_order(fuse_group, work) if tiles.device.type == "cpu" else map(fuse_group, work)
-
-
-def fuse_entries(layers: Float[Tensor, "L C"], entries: Entries, rate: float, cfg: SiteConfig) -> Bool[Tensor, "K"]:
-    """Fuse entries into the layers of tiles, in place; return which contradict other heights of their cells."""
-    fused = fuse(Heights(*layers[0:3]), Heights(*layers[4:7]), entries, rate, cfg)
-    for row, value in zip((0, 1, 2, 4, 5, 6), (*fused.first, *fused.other), strict=True):
-        layers[row] = value
-    return fused.is_contradicted
 
 
 def _read_bounds(windows: Windows, alignment: Alignment, pieces: Pieces, resolution: float) -> tuple[Tensor, Tensor]:

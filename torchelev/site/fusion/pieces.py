@@ -29,7 +29,7 @@ class Pieces(NamedTuple):
 
     def select(self, mask: Bool[Tensor, "B H W"]) -> tuple[Tensor, Tensor, Tensor]:
         """Return robot, cell number in the group and place in the flat windows of the cells of a mask, (K,) each."""
-        chosen = (self.is_inside & mask.view(-1).take(self.place)).view(-1).nonzero()[:, 0]
+        chosen = (self.is_inside & mask.reshape(-1).take(self.place)).view(-1).nonzero()[:, 0]
         piece = chosen >> CELL_BITS
         cell = (self.tile - torch.arange(len(self.tile), device=chosen.device)).index_select(0, piece) * CELLS + chosen
         return self.robot.index_select(0, piece), cell, self.place.view(-1).index_select(0, chosen)

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from torchelev.elevation_map import ElevationMap
     from torchelev.site.fusion.shares import Share
+    from torchelev.site.fusion.stacks import Stack
 
 _NANOSECONDS = 1e-9
 BEFORE_ALL = -(10**18)  # [ns] earlier than anything on a map's clock
@@ -29,6 +30,10 @@ class Alignment(NamedTuple):
     offset: Float[Tensor, "B"]  #: [m]
     tilt: Float[Tensor, "B 2"]  #: rise over run along x and y
     is_isolated: Bool[Tensor, "B"]  #: overlaps no other window and not the site; its offset is its last one, or 0
+
+    def of_moved(self, away: Float[Tensor, "B 2"]) -> Alignment:
+        """Return the same alignment of windows whose centres, about which tilts turn, lie farther away [m]."""
+        return self._replace(offset=self.offset + (self.tilt * away).sum(1))
 
 
 def no_alignment(num_windows: int, device: torch.device) -> Alignment:
@@ -71,6 +76,7 @@ class Contribution(NamedTuple):
     num_resets: Int[Tensor, "B"]  #: of the maps until then
     keyframe: Int[Tensor, "B"]  #: id of that merge's keyframe; -1: none was kept
     shares: Mapping[str, Share] = MappingProxyType({})  #: of the site's channels, by name
+    stack: Stack | None = None  #: of a site with levels: all surfaces that they knew; None: the ground alone
 
 
 def no_contribution(known: Known, num_resets: Int[Tensor, "B"]) -> Contribution:
@@ -131,7 +137,10 @@ def drop_reset(contribution: Contribution, num_resets: Int[Tensor, "B"], elapsed
     elapsed = torch.where(was_reset, BEFORE_ALL, contribution.elapsed)
     alignment = Alignment(offset, tilt, is_isolated)
     keyframe = torch.where(was_reset, -1, contribution.keyframe)
-    return Contribution(known, alignment, elapsed, num_resets.clone(), keyframe, contribution.shares)
+    stack = contribution.stack
+    if stack is not None:
+        stack = stack._replace(is_known=stack.is_known & ~was_reset[:, None, None, None])
+    return Contribution(known, alignment, elapsed, num_resets.clone(), keyframe, contribution.shares, stack)
 
 
 def _find_new(state: MapState, known: Known, contribution: Contribution | None) -> Bool[Tensor, "B H W"]:
@@ -141,12 +150,18 @@ def _find_new(state: MapState, known: Known, contribution: Contribution | None) 
     """
     if contribution is None:
         return known.is_known
-    since = ((state.elapsed - contribution.elapsed).double() * _NANOSECONDS)[:, None, None]
-    # Ages are sums in float32, whose rounding must not make an old measurement new.
-    is_younger = state.time < since * (1 - 1e-4) - 1e-6
     layers = move_known(contribution.known, state.corner)
     has_changed = (known.elevation != layers.elevation) | (known.variance < layers.variance)
-    return known.is_known & (~layers.is_known | (is_younger & has_changed))
+    passed = state.elapsed - contribution.elapsed
+    return find_new(known.is_known, layers.is_known, has_changed, state.time, passed)
+
+
+def find_new(is_known: Tensor, was_known: Tensor, has_changed: Tensor, age: Tensor, passed: Int[Tensor, "B"]) -> Tensor:
+    """Return which known cells are new, (B, ...): `passed` [ns] since the contribution, which `was_known`."""
+    since = (passed.double() * _NANOSECONDS).view(-1, *(1 for _ in age.shape[1:]))
+    # Ages are sums in float32, whose rounding must not make an old measurement new.
+    is_younger = age < since * (1 - 1e-4) - 1e-6
+    return is_known & (~was_known | (is_younger & has_changed))
 
 
 def move_known(known: Known, corner: Int[Tensor, "B 2"]) -> Known:
@@ -166,8 +181,9 @@ def snapshot(
     elapsed: Int[Tensor, "B"],
     keyframe: Int[Tensor, "B"],
     shares: Mapping[str, Share] = MappingProxyType({}),
+    stack: Stack | None = None,
 ) -> Contribution:
-    """Return a map's contribution at a merge, as copies, with its keyframes, the maps' clocks, and these shares."""
+    """Return a map's contribution at a merge, as copies, with its keyframes, the maps' clocks, and what it is given."""
     known = Known(*(value.clone() for value in windows.known))
     num_resets = emap.num_resets.to(elapsed.device, copy=True)
-    return Contribution(known, alignment, elapsed.clone(), num_resets, keyframe, shares)
+    return Contribution(known, alignment, elapsed.clone(), num_resets, keyframe, shares, stack)

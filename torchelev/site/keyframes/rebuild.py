@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from torchelev.site.fusion.entries import fuse_entries
 from torchelev.site.fusion.fuse import Entries, Heights
-from torchelev.site.fusion.merge import Merged, fuse_entries, lower_bounds
+from torchelev.site.fusion.merge import Merged, lower_bounds
 from torchelev.site.keyframes.keyframe_log import KeyframeLog
 from torchelev.site.keyframes.keyframes import BOUND, CONTRIBUTED, OWN, Recorded, Rows, join
 from torchelev.site.keyframes.moves import Moves, find_footprints, find_moves, look_up

@@ -31,20 +31,23 @@ from torchelev.site.channels import SiteChannels
 from torchelev.site.fusion.windows import Windows
 from torchelev.site.shared.packing import Layout, pack, unpack
 from torchelev.site.shared.ranks import Ranks
+from torchelev.site.site_levels import SiteLevels
 from torchelev.site.tiles import LAYERS, TILE
 
 if TYPE_CHECKING:
     from torchelev.site.storage.store import TileStore
 
 
-def open_shared(ranks: Ranks, call: str, path: str | Path, resolution: float, channels: SiteChannels) -> TileStore:
+def open_shared(
+    ranks: Ranks, call: str, path: str | Path, resolution: float, channels: SiteChannels, levels: SiteLevels
+) -> TileStore:
     """Create or open a site's folder on rank 0 for writing, and then open it on the others, read-only."""
     store = None
     try:
         for turn in (True, False):
             with ranks.together(call):
                 if (ranks.rank == 0) == turn:
-                    store = _open(path, resolution, channels, not turn)
+                    store = _open(path, resolution, channels, levels, not turn)
     except BaseException:
         if store is not None:
             store.close()
@@ -53,15 +56,18 @@ def open_shared(ranks: Ranks, call: str, path: str | Path, resolution: float, ch
     return store
 
 
-def _open(path: str | Path, resolution: float, channels: SiteChannels, read_only: bool) -> TileStore:
+def _open(
+    path: str | Path, resolution: float, channels: SiteChannels, levels: SiteLevels, read_only: bool
+) -> TileStore:
     """Create a site's folder, or open one that is there, of the same resolution."""
     from torchelev.site.storage.store import TileStore
 
     path = Path(path)
     exists = (path / "zarr.json").exists()
     if not exists and not read_only:
-        attributes = {"resolution": resolution, "channels": channels.attributes}
-        return TileStore.create(path, layers=(*LAYERS, *channels.stored), tile_size=TILE, attributes=attributes)
+        attributes = {"resolution": resolution, "channels": channels.attributes} | levels.attributes
+        layers = (*LAYERS, *channels.stored, *levels.stored)
+        return TileStore.create(path, layers=layers, tile_size=TILE, attributes=attributes)
     require(exists, "path", "must be a folder that all ranks see", path, "mount it on every machine", OSError)
     store = TileStore.open(path, read_only=read_only)
     actual, hint = float(store.attributes["resolution"]), "give that resolution, or another path"

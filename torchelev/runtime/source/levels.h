@@ -1,0 +1,52 @@
+// The surfaces of a map besides its ground, kept between updates: levels/module.py.
+#pragma once
+
+#include <memory>
+#include <string>
+#include <vector>
+
+#include "runtime/source/config.h"
+
+// A tensor as files and readers see it.
+struct Stored {
+    const char *name, *dtype;    // of safetensors
+    std::vector<int64_t> shape;  // of one map
+    void* data;
+    size_t size;  // [bytes] of an element
+    bool has_infinities;
+
+    int64_t count() const {
+        int64_t number = 1;
+        for (const int64_t length : shape) number *= length;
+        return number;
+    }
+    size_t bytes() const { return count() * size; }
+};
+
+struct Ceiling {
+    float height;
+    bool known;
+};
+
+class MapLevels {
+    const Config& cfg;
+    int64_t H, W, L;
+    int64_t corner[2];  // of the window that the rings hold
+    std::vector<float> lower, upper, variance, support, time, free_top;
+    std::vector<uint8_t> is_open, aside;
+    int64_t statistics[5];
+
+    int64_t place(const MapState& state, int64_t cell) const;  // in the ring; -1 outside of its window
+
+  public:
+    MapLevels(const Config& cfg, const torchelev_limits& limits);
+
+    // Take the points of other surfaces out of an update of a recentred map, and choose its ground, in place.
+    void sort_points(const MapState& state, const Sizes& sizes, Inputs& inputs, int num_threads);
+    void raise(float height);  // [m] as drift compensation raised the ground
+    void forget();
+    void forget_cell(const MapState& state, int64_t cell);
+    // The underside of the lowest surface above a cell's ground [m]: `ceiling` of levels/views.py.
+    Ceiling ceiling(const MapState& state, int64_t cell) const;
+    std::vector<Stored> stored();
+};
