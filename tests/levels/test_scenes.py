@@ -7,6 +7,7 @@ import torch
 
 from tests.levels.walks import at, line, make_map, walk
 from torchelev import LevelsConfig, SensorConfig
+from torchelev.observations import VoxelCrop
 from torchelev.sim.exact import covered_scenes
 from torchelev.sim.exact.covered_scenes import RISE, RUN
 from torchelev.sim.exact.scenes import Box, Scene, block, boxes, flat
@@ -135,3 +136,15 @@ def test_the_gap_alone_separates_where_it_is_asked_to(separation, expected):
     emap = make_map(levels=LevelsConfig(separation=separation), sensor=sensor)
     emap.update(points - torch.tensor([0.0, 0.0, 0.8]), T, T, dt=0.1)
     assert at(emap, "elevation", 1.05, 0.05, level=1) == pytest.approx(expected, abs=1e-3, nan_ok=True)
+
+
+def test_rays_over_a_beam_do_not_make_the_space_within_free():
+    emap = make_map()
+    beam = Box(low=(1.0, -3.0, 0.9), high=(1.6, 3.0, 1.3))
+    wall = block(2.6, 2.8, -3.0, 3.0, 3.0)
+    walk(emap, Scene(boxes=(beam, wall)), line((-1.6, 0.0, 0.0), (-1.2, 0.0, 0.0), 6))
+    crop = VoxelCrop(length_x=0.1, length_y=0.1, resolution=0.1, offset=(1.3, 0.0, 0.5))
+    T = torch.eye(4)[None]
+    states = crop(emap, T)[0, 0, 0].tolist()  # from 0.5 m below the ground to 1.5 m above it
+    assert states[7:11] == [0, 0, 0, 0], "below the beam rays passed"
+    assert 0 not in states[15:17], "rays over the beam say nothing of what is below them"

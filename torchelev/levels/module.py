@@ -17,7 +17,6 @@ from torchelev.levels.state import (
     blank_levels,
     forget_space,
     move,
-    raise_by,
     remove,
     turn,
 )
@@ -44,6 +43,7 @@ class MapLevels(nn.Module):
 
     corner: Tensor
     lower: Tensor
+    upper: Tensor
     free_top: Tensor
     is_open: Tensor
 
@@ -106,9 +106,9 @@ class MapLevels(nn.Module):
         if self.cfg.drift is None:
             return
         height = state.statistics.drift_correction.float()
-        for stored, new in zip(self.stored, raise_by(self.stored, height), strict=True):
-            if new is not stored:
-                stored.copy_(new)
+        self.lower.add_(height[:, None, None, None])
+        self.upper.add_(height[:, None, None, None])
+        self.free_top.add_(height[:, None, None])
 
     @torch.no_grad()
     def follow(self, state: MapState) -> None:

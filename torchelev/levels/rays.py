@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 MARGIN = 1.5  # [cells] behind a place that a ray must reach
 NEAREST = 3.0  # [cells] from the sensor, below which directions cover too much
+RISE = 0.5  # [cells] by which free space must grow to be looked at
 MAX_WINDOW = 8  # [bins] of azimuth on either side of a place
 
 
@@ -146,6 +147,46 @@ def ray_heights(sights: list[Sight], x: Tensor, y: Tensor, size: SightGrid) -> R
         highest = torch.maximum(highest, z + sight.highest.gather(1, place) * d)
         lowest = torch.minimum(lowest, z + sight.lowest.gather(1, place) * d)
     return RayHeights(highest, lowest)
+
+
+def height_of(elevation: int, d: Tensor, size: SightGrid) -> Tensor:
+    """Return the least height of a bin of elevation above the sensor, at some distance [m]."""
+    t = 2 * elevation / size.elevations - 1
+    return t / (1 - abs(t)) * d if abs(t) < 1 else torch.full_like(d, math.copysign(math.inf, t))
+
+
+def raise_free_top(
+    free_top: Tensor, floor: Tensor, sights: list[Sight], x: Tensor, y: Tensor, min_gap: float, size: SightGrid
+) -> Float[Tensor, "B cells"]:
+    """Return up to which height the space above a floor is free, where rays show that it is more than was known [m].
+
+    Rays beyond a cell show it up to the highest of them, unless one between half of `min_gap` above the floor, or what
+    was known, and that height ends before: what hangs there is not passed by rays above it.
+
+    Args:
+        free_top: known before (B, cells) [m]; -inf: nothing.
+        floor: (B, cells) [m]; NaN: not known, and nothing is raised.
+        sights: what the rays of each sensor saw.
+        x: centres of the cells (B, cells) [m].
+        y: centres of the cells (B, cells) [m].
+        min_gap: [m] of the levels.
+        size: of the tables.
+    """
+    for sight in sights:
+        dx, dy = x - sight.origin[:, 0, None], y - sight.origin[:, 1, None]
+        d, z, azimuth = horizontal(dx, dy), sight.origin[:, 2, None], azimuth_bin(dx, dy, size)
+        row = (d / size.resolution + MARGIN).to(torch.int64).clamp(max=size.ranges - 1)
+        highest = z + sight.highest.gather(1, row * size.azimuths + azimuth) * d
+        begin = torch.maximum(free_top, floor + 0.5 * min_gap)
+        rises = highest > torch.maximum(free_top, floor) + RISE * size.resolution
+        first, last = (elevation_bin(d, h - z, size) for h in (begin, torch.maximum(begin, highest)))
+        limit, behind = highest.clone(), d + MARGIN * size.resolution
+        for e in reversed(range(size.elevations)):
+            ends = sight.nearest[:, e * size.azimuths :].gather(1, azimuth) < behind
+            ends = ends & (first <= e) & (e <= last)
+            limit = torch.where(ends, torch.minimum(highest, z + height_of(e, d, size)), limit)
+        free_top = torch.where(rises, torch.maximum(free_top, limit), free_top)
+    return free_top
 
 
 def floats(

@@ -25,7 +25,7 @@ class Levels(NamedTuple):
     variance: Float[Tensor, "B L H W"]  #: [m^2] of either height
     support: Float[Tensor, "B L H W"]  #: points that measured it; 0: the place is empty
     time: Float[Tensor, "B L H W"]  #: [s] since the last of them
-    free_top: Float[Tensor, "B H W"]  #: [m] height of the highest ray over the cell; -inf: none passed
+    free_top: Float[Tensor, "B H W"]  #: [m] up to which rays showed that the space above the ground is free; -inf: none
     is_open: Bool[Tensor, "B H W"]  #: rays passed close above the ground, and higher by `min_gap`: it is no wall's foot
 
 

@@ -20,6 +20,7 @@ from torchelev.levels.rays import (
     floats,
     look,
     nearest_around,
+    raise_free_top,
     ray_heights,
 )
 from torchelev.levels.state import Levels, LevelStatistics, age, forget_space, remove
@@ -98,7 +99,9 @@ def update_levels(levels: Levels, state: MapState, m: Measurement, cfg: Elevatio
     highest, lowest = scan.rays
     is_firm = state.validity & (state.support >= own.least_support)
     opens = is_firm & (lowest < state.elevation + 0.5 * own.min_gap) & (highest >= state.elevation + own.min_gap)
-    levels = levels._replace(free_top=torch.maximum(levels.free_top, highest), is_open=levels.is_open | opens)
+    floor = torch.where(state.validity, state.elevation, torch.nan)
+    given = scan.sights, scan.x, scan.y, own.min_gap, _size(cfg)
+    levels = levels._replace(free_top=raise_free_top(levels.free_top, floor, *given), is_open=levels.is_open | opens)
     levels, state, changed = _choose(points._replace(levels=levels), m, scan, cfg)
     aside = inside & (points.aside | changed.gather(1, slot))
     return Step(

@@ -37,7 +37,7 @@ class VoxelCrop:
 
     - 1, occupied: its centre lies below the ground, or it meets another surface
     - 0, free: its centre lies above the ground, or above the upper bound of ground that is not known, and below the
-      lowest surface above, or where there is none, below the highest ray over the cell
+      lowest surface above, or where there is none, as high as rays over the cell show it
     - 2, unknown: else, and outside the map's window
 
     "distances" are float32 [m]: from the centre of a free or unknown voxel to that of the nearest occupied one, and

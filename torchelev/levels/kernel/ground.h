@@ -29,6 +29,7 @@ struct Several {
     float height[MOST];     // [m] of the surfaces, 0 the ground; NaN: not there, or of too few points
     uint16_t firm = 0;      // surfaces of many points, a bit each
     uint16_t entered = 0;   // levels that a way from the ground may lead to, a bit each
+    bool is_open = false;   // one of them may be reached before the ground
     int8_t first = UNDECIDED;
     int32_t decided_in = 0;  // the step in which it was reached first
 };
@@ -65,53 +66,48 @@ struct Search {
     // Find the highest surface below the base in the cell nearest to it that has one, or in the nearest within NEAR
     // where that has many points.
     Standing find_standing(const float* base, const float* x, const float* y) const {
-        const int64_t i = nearest_of(x, H, base[0]), j = nearest_of(y, W, base[1]);
-        const float step = H > 1 ? x[1] - x[0] : 1;
-        const int64_t around = int64_t(std::ceil(NEAR / step)) + 1;
-        float square;
-        const Standing settled = search(base, x, y, i - around, i + around, j - around, j + around, true, square);
-        if (settled.found && square <= NEAR * NEAR) return settled;
-        const Standing weak = search(base, x, y, i - around, i + around, j - around, j + around, false, square);
-        return weak.found && square <= NEAR * NEAR ? weak : search(base, x, y, 0, H - 1, 0, W - 1, false, square);
+        const Standing settled = nearest(base, x, y, true, NEAR * NEAR);
+        return settled.found ? settled : nearest(base, x, y, false, std::numeric_limits<float>::infinity());
     }
 
-    // Mark the levels that a way from the robot may lead to: those a step from ground, and from each other. Return
-    // whether one may be reached before the ground of its cell: a level that is entered only from where that ground is
-    // entered too never is.
+    // Find the cells of which a level may be reached before the ground; return whether there are any. A way may lead to
+    // levels a step from ground, and on to those a step from them. A level that is entered only from where the ground
+    // below it is entered too is never first.
     bool enter(const Standing& standing) {
-        bool may_be_first = standing.surface > 0;
-        nodes.clear();
-        if (standing.surface > 0) mark(several[entry[standing.cell]], standing.surface);
+        undecided = 0, nodes.clear();
+        if (standing.surface > 0) {
+            Several& own = several[entry[standing.cell]];
+            own.is_open = true, undecided++, mark(own, standing.surface);
+        }
         for (Several& own : several)
             for (int k = 1; k < K; k++)
                 if (touches_ground(own, k)) mark(own, k);
         while (!nodes.empty()) {
-            const Several& own = several[nodes.back().first];
+            Several& own = several[nodes.back().first];
             const int k = nodes.back().second;
             nodes.pop_back();
             for (const int64_t away : {-pitch, pitch, int64_t(-1), int64_t(1)}) {
                 const int64_t c = own.cell + away;
-                may_be_first |= leads_up(own, k, height[c]);
+                lead_to(own, k, height[c]);
                 if (entry[c] < 0) continue;
                 Several& other = several[entry[c]];
                 for (int m = 1; m < K; m++)
                     if (std::fabs(other.height[m] - own.height[k]) <= max_step)
-                        mark(other, m), may_be_first |= leads_up(other, m, own.height[k]);
+                        mark(other, m), lead_to(other, m, own.height[k]);
             }
         }
-        return may_be_first;
+        return undecided > 0;
     }
 
-    // Search until the cells whose levels were entered are reached; `is_whole`: until all are.
+    // Search until the open cells are reached; `is_whole`: until all are.
     void run(const Standing& standing, bool is_whole) {
         open.assign(cells, 0), blind.resize(cells);
         if (next.size() <= size_t(K + 1) * cells) wave.resize((K + 1) * cells + 1), next.resize((K + 1) * cells + 1);
         for (int64_t i = 0; i < H; i++)
             for (int64_t c = at(i, 0); c < at(i, W); c++) open[c] = height[c] == height[c] ? 1 | KNOWN : GUESS;
-        undecided = 0;
         for (const Several& own : several) {
             for (int k = 1; k < K; k++) open[own.cell] |= uint16_t(own.height[k] == own.height[k]) << k;
-            if (own.entered) open[own.cell] |= ENTERED, undecided++;
+            if (own.is_open) open[own.cell] |= OPEN;
         }
         step = 0, number = 0, fresh.clear();
         if (standing.found) reach(standing.surface, standing.cell);
@@ -127,8 +123,8 @@ struct Search {
 
   private:
     // Bits of `open` besides those of the surfaces that were not reached: the ground is known; its guess was not
-    // reached; it came in this step; levels of the cell were entered.
-    static constexpr uint16_t KNOWN = 1 << 12, GUESS = 1 << 13, FRESH = 1 << 14, ENTERED = 1 << 15;
+    // reached; it came in this step; a level may be first.
+    static constexpr uint16_t KNOWN = 1 << 12, GUESS = 1 << 13, FRESH = 1 << 14, OPEN = 1 << 15;
     static constexpr int SHIFT = 27;
     std::vector<uint16_t> open;       // (cells)
     std::vector<int32_t> blind;       // (cells) cells since the last surface
@@ -136,7 +132,7 @@ struct Search {
     std::vector<int32_t> fresh;       // cells whose guess came in this step
     std::vector<std::pair<int32_t, int>> nodes;  // entry and surface
     int64_t number = 0;                          // of nodes in `next`
-    int64_t undecided = 0;                       // cells with levels that were entered, and that were not reached
+    int64_t undecided = 0;                       // open cells that were not reached
     int32_t step = 0;
 
     static int64_t nearest_of(const float* centers, int64_t size, float value) {
@@ -156,22 +152,36 @@ struct Search {
         return top;
     }
 
-    Standing search(const float* base, const float* x, const float* y, int64_t i0, int64_t i1, int64_t j0, int64_t j1,
-                    bool is_firm, float& square) const {
+    // Of cells at one distance the first; rows and columns outwards, so that the nearest come first.
+    Standing nearest(const float* base, const float* x, const float* y, bool is_firm, float square) const {
         Standing best;
-        square = std::numeric_limits<float>::infinity();
-        for (int64_t i = std::max<int64_t>(i0, 0); i <= std::min(i1, H - 1); i++)
-            for (int64_t j = std::max<int64_t>(j0, 0); j <= std::min(j1, W - 1); j++) {
-                const float dx = x[i] - base[0], dy = y[j] - base[1], away = dx * dx + dy * dy;
-                if (!(away < square)) continue;
-                const int64_t c = at(i, j);
-                const int top = top_below(c, base[2]);
-                if (top < 0) continue;
-                const bool has_many = entry[c] < 0 ? support[i * W + j] >= SETTLED : several[entry[c]].firm >> top & 1;
-                if (is_firm && !has_many) continue;
-                best = {c, top, top > 0 ? several[entry[c]].height[top] : height[c], true}, square = away;
-            }
+        if (!(base[0] == base[0] && base[1] == base[1])) return best;
+        const int64_t middle = nearest_of(x, H, base[0]), column = nearest_of(y, W, base[1]);
+        const auto try_cell = [&](int64_t i, int64_t j, float dx) {
+            const float dy = y[j] - base[1], away = dx * dx + dy * dy;
+            if (away > square) return false;
+            const int64_t c = at(i, j);
+            if (best.found && away == square && c > best.cell) return true;
+            const int top = top_below(c, base[2]);
+            if (top < 0 || (is_firm && !has_many(i, j, top))) return true;
+            best = {c, top, top > 0 ? several[entry[c]].height[top] : height[c], true}, square = away;
+            return true;
+        };
+        const auto try_row = [&](int64_t i) {
+            const float dx = x[i] - base[0];
+            if (dx * dx > square) return false;
+            for (int64_t j = column; j < W && try_cell(i, j, dx); j++) {}
+            for (int64_t j = column - 1; j >= 0 && try_cell(i, j, dx); j--) {}
+            return true;
+        };
+        for (int64_t i = middle; i < H && try_row(i); i++) {}
+        for (int64_t i = middle - 1; i >= 0 && try_row(i); i--) {}
         return best;
+    }
+
+    bool has_many(int64_t i, int64_t j, int surface) const {
+        const int64_t k = entry[at(i, j)];
+        return k < 0 ? support[i * W + j] >= SETTLED : several[k].firm >> surface & 1;
     }
 
     bool touches_ground(const Several& own, int k) const {
@@ -180,9 +190,11 @@ struct Search {
         return false;
     }
 
-    // Whether a level is a step from a height, and the ground below it is not.
-    bool leads_up(const Several& own, int k, float from) const {
-        return std::fabs(from - own.height[k]) <= max_step && !(std::fabs(from - own.height[0]) <= max_step);
+    // Note that a way may lead from a height to a level, and not to the ground of its cell.
+    void lead_to(Several& own, int k, float from) {
+        if (own.is_open || !(std::fabs(from - own.height[k]) <= max_step) || std::fabs(from - own.height[0]) <= max_step)
+            return;
+        own.is_open = true, undecided++;
     }
 
     void mark(Several& own, int k) {
@@ -192,7 +204,7 @@ struct Search {
 
     void reach(int k, int64_t c) {
         open[c] &= uint16_t(~(k == K ? GUESS : 1 << k)), next[number++] = int32_t(k) << SHIFT | int32_t(c);
-        if (!(open[c] & ENTERED)) return;
+        if (!(open[c] & OPEN)) return;
         Several& own = several[entry[c]];
         const int8_t surface = k == K ? NONE : int8_t(k);
         if (own.first == UNDECIDED) own.first = surface, own.decided_in = step, undecided--;

@@ -25,6 +25,7 @@ struct Scratch {
     std::vector<float> bottom, top;            // (H W) [m] of the scan's points
     std::vector<int32_t> number, list;         // (H W) of the scan's points; place in `complex`, -1 for none
     std::vector<uint8_t> all_above, changed;   // (H W)
+    std::vector<uint8_t> had_levels;           // (H W) of the ring, before the scan
     std::vector<uint8_t> simple;               // of `touched`
     std::vector<int32_t> touched, complex, first, sorted;
     std::vector<Waiting> waiting;              // of `complex`
@@ -122,15 +123,26 @@ struct Map {
         const float dt = u.dt[b] > 0 && u.dt[b] < INFINITE ? u.dt[b] : 0, added = u.variance_rate * dt;
         const int64_t first = b * u.L * cells, number = u.L * cells;
         grow_older(u.support + first, u.time + first, u.level_variance + first, number, dt, added, u.max_variance);
+        own.had_levels.assign(cells, 0);
+        for (int64_t l = 0; l < u.L; l++) note_levels(u.support + first + l * cells, own.had_levels.data(), cells);
     }
 
-    static void grow_older(const float* __restrict support, float* __restrict time, float* __restrict variance,
-                           int64_t number, float dt, float added, float most) {
-        for (int64_t p = 0; p < number; p++) {
-            const bool is_there = support[p] > 0;
-            const float older = std::min(variance[p] + added, most);
-            time[p] = time[p] + (is_there ? dt : 0.0f), variance[p] = is_there ? older : variance[p];
+    static void grow_older(const float* support, float* __restrict time, float* __restrict variance, int64_t number,
+                           float dt, float added, float most) {
+        for (int64_t first = 0; first < number; first += BLOCK) {
+            const int64_t end = std::min(first + BLOCK, number);
+            int32_t any = 0;
+            for (int64_t p = first; p < end; p++) any |= support[p] > 0;
+            for (int64_t p = first; any && p < end; p++) {  // mostly none
+                const bool is_there = support[p] > 0;
+                const float older = std::min(variance[p] + added, most);
+                time[p] = time[p] + (is_there ? dt : 0.0f), variance[p] = is_there ? older : variance[p];
+            }
         }
+    }
+
+    static void note_levels(const float* support, uint8_t* __restrict had, int64_t number) {
+        for (int64_t p = 0; p < number; p++) had[p] |= support[p] > 0;
     }
 
     void blank(int64_t p) const {
@@ -259,7 +271,7 @@ struct Map {
 
     // Whether all points of a cell are its ground's, or could become it: most are.
     bool is_simple(int64_t c) const {
-        if (has_levels(place(c))) return false;
+        if (own.had_levels[place(c)]) return false;
         const float low = own.bottom[c], high = own.top[c];
         if (!u.validity[b * cells + c]) return high - low <= u.min_gap && !own.all_above[c] && !floats(c, low);
         const float g = u.elevation[b * cells + c];
@@ -401,7 +413,7 @@ struct Map {
         }
     }
 
-    // Merge surfaces that meet, and clear those that rays passed through; note the highest rays.
+    // Merge surfaces that meet, and clear those that rays passed through; note what space is free.
     void tidy() {
         std::atomic<int64_t> merged{0}, cleared{0};
         own.with_levels.resize(parts.number);
@@ -419,7 +431,8 @@ struct Map {
     void tidy_stretch(int64_t first, int64_t p, int64_t number, int64_t* numbers, std::vector<int32_t>& found) const {
         const int64_t n = b * cells + first;
         const Space space{u.elevation + n, &own.highest[first], &own.lowest[first], u.ground_support + n, u.validity + n};
-        raise_free_top(space, &free_top(p), &is_open(p), number, u.min_gap, std::max(u.min_support, 0.5f));
+        note_open(space, &is_open(p), number, u.min_gap, std::max(u.min_support, 0.5f));
+        raise_free_top(space, first, &free_top(p), number);
         for (int64_t begin = 0; begin < number; begin += BLOCK) {
             const int64_t size = std::min(BLOCK, number - begin);
             if (!any_levels(p + begin, size)) continue;  // mostly
@@ -446,13 +459,22 @@ struct Map {
         const uint8_t* known;
     };
 
-    static void raise_free_top(const Space& space, float* __restrict top, uint8_t* __restrict open, int64_t number,
-                               float gap, float least) {
+    static void note_open(const Space& space, uint8_t* __restrict open, int64_t number, float gap, float least) {
         const float *g = space.ground, *high = space.high, *low = space.low, *support = space.support;
         const uint8_t* known = space.known;
-        for (int64_t n = 0; n < number; n++) top[n] = std::max(top[n], high[n]);
         for (int64_t n = 0; n < number; n++)
             open[n] |= known[n] & uint8_t((support[n] >= least) & (low[n] < g[n] + 0.5f * gap) & (high[n] >= g[n] + gap));
+    }
+
+    void raise_free_top(const Space& space, int64_t first, float* top, int64_t number) const {
+        const float step = levels::RISE * float(u.resolution);
+        for (int64_t n = 0; n < number; n++) {
+            const float floor = space.ground[n];
+            if (!space.known[n] || !(space.high[n] > std::max(top[n], floor) + step)) continue;  // mostly
+            const int64_t c = first + n;
+            for (const levels::Sight& sight : own.sights)
+                top[n] = sight.raise_free_top(top[n], floor, own.x[c / u.W], own.y[c % u.W], u.min_gap, sights.size);
+        }
     }
 
     void tidy_cell(int64_t c, int64_t p, int64_t* numbers) const {

@@ -34,11 +34,17 @@ struct SightGrid {
         const float fraction = 0.5f + 0.5f * (dz / std::max(rho + std::fabs(dz), 1e-12f));
         return std::min(int32_t(fraction * float(elevations)), elevations - 1);
     }
+    float height_of(int32_t elevation, float d) const {
+        const double t = 2 * double(elevation) / elevations - 1;
+        return elevation > 0 ? float(t / (1 - std::fabs(t))) * d : -INFINITE;
+    }
 };
 
 struct Slopes {
     float highest, lowest;
 };
+
+constexpr float RISE = 0.5f;
 
 // What the rays of one sensor saw.
 struct Sight {
@@ -86,6 +92,21 @@ struct Sight {
         float d;
         const float found = nearest_around(x, y, z, size, d);
         return found < INFINITE && found >= d + MARGIN * size.resolution && d >= NEAREST * size.resolution;
+    }
+
+    // Return up to which height the space above a floor is free: `raise_free_top`.
+    float raise_free_top(float top, float floor, float x, float y, float min_gap, const SightGrid& size) const {
+        const float dx = x - origin[0], dy = y - origin[1], d = horizontal(dx, dy);
+        const int32_t azimuth = size.azimuth_bin(dx, dy);
+        const int32_t row = std::min(int32_t(d / size.resolution + MARGIN), size.ranges - 1);
+        const float highest = origin[2] + slopes[int64_t(row) * size.azimuths + azimuth].highest * d;
+        if (!(highest > std::max(top, floor) + RISE * size.resolution)) return top;
+        const float begin = std::max(top, floor + 0.5f * min_gap), behind = d + MARGIN * size.resolution;
+        const int32_t last = size.elevation_bin(d, std::max(begin, highest) - origin[2]);
+        for (int32_t e = size.elevation_bin(d, begin - origin[2]); e <= last; e++)
+            if (nearest[int64_t(e) * size.azimuths + azimuth] < behind)
+                return std::max(top, std::min(highest, origin[2] + size.height_of(e, d)));
+        return std::max(top, highest);
     }
 
     // Whether rays passed through a surface of a cell: `_seen_through`.
