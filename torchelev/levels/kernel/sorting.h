@@ -1,0 +1,152 @@
+// Sorting the points of a scan into the ground and other surfaces: `_sort_points`.
+#pragma once
+
+#include "levels/kernel/scan.h"
+
+namespace levels {
+
+constexpr int64_t FEW = 32;  // points that insertion sorts fastest
+constexpr float SAME = 0.1f;
+
+// A cluster of points: clusters.py.
+struct Cluster {
+    float lower, upper, weight = 0, lift = 0, number = 0;
+    bool above = true;
+    int64_t begin, end;  // among the sorted points
+
+    Found found(float variance_floor) const {
+        const float mean = lower + lift / (weight > 0 ? weight : 1.0f);
+        return {lower, upper, mean, std::max(1 / weight, variance_floor), number / weight, number};
+    }
+};
+
+struct Sorting : Scan {
+    using Scan::Scan;
+
+    // Whether all points of a cell are its ground's, or could become it: most are.
+    bool is_simple(int64_t c) const {
+        if (own.had_levels[place(c)]) return false;
+        const float low = own.bottom[c], high = own.top[c];
+        if (!u.validity[b * cells + c]) return high - low <= u.min_gap && !own.all_above[c] && !floats(c, low);
+        const float g = u.elevation[b * cells + c];
+        return g - low <= u.min_gap && high - g <= u.min_gap && !floats(c, g);
+    }
+
+    void sort_points() {
+        std::fill_n(u.aside + b * M, M, 0);
+        own.list.assign(cells, -1), own.complex.clear(), own.first.assign(1, 0);
+        own.simple.resize(own.touched.size());
+        parts(int64_t(own.touched.size()), [&](int64_t, int64_t begin, int64_t end) {
+            for (int64_t k = begin; k < end; k++) own.simple[k] = is_simple(own.touched[k]);
+        });
+        for (size_t k = 0; k < own.touched.size(); k++) {
+            const int32_t c = own.touched[k];
+            if (own.simple[k]) continue;
+            own.list[c] = int32_t(own.complex.size()), own.complex.push_back(c);
+            own.first.push_back(own.first.back() + own.number[c]);
+        }
+        own.waiting.assign(own.complex.size(), {0, 0});
+        if (own.complex.empty()) return;
+        own.sorted.resize(own.first.back());
+        std::vector<int32_t> next(own.first.begin(), own.first.end() - 1);
+        for (int64_t m = 0; m < M; m++) {
+            const int32_t c = own.points.cell[m];
+            if (c >= 0 && own.list[c] >= 0) own.sorted[next[own.list[c]]++] = int32_t(m);
+        }
+        std::atomic<int64_t> opened{0}, dropped{0};
+        parts(int64_t(own.complex.size()), [&](int64_t, int64_t begin, int64_t end) {
+            int64_t of_part[STATISTICS] = {};
+            for (int64_t k = begin; k < end; k++)
+                sort_cell(own.complex[k], own.first[k], own.first[k + 1], own.waiting[k], of_part);
+            opened += of_part[OPENED], dropped += of_part[DROPPED];
+        });
+        statistics[OPENED] += opened, statistics[DROPPED] += dropped;
+    }
+
+    // The clusters of a cell from below: `find_clusters`.
+    void find_clusters(int64_t begin, int64_t end, std::vector<Cluster>& clusters) {
+        const std::vector<float>& z = own.points.z;
+        const auto is_lower = [&](int32_t a, int32_t c) { return z[a] < z[c]; };
+        int32_t* const order = own.sorted.data();
+        if (end - begin > FEW) {
+            std::stable_sort(order + begin, order + end, is_lower);
+        } else {
+            for (int64_t k = begin + 1; k < end; k++) {
+                const int32_t m = order[k];
+                int64_t to = k;
+                for (; to > begin && is_lower(m, order[to - 1]); to--) order[to] = order[to - 1];
+                order[to] = m;
+            }
+        }
+        clusters.clear();
+        for (int64_t k = begin; k < end; k++) {
+            const int32_t m = own.sorted[k];
+            if (k == begin || z[m] - z[own.sorted[k - 1]] > u.min_gap) {
+                clusters.emplace_back();
+                clusters.back().lower = z[m], clusters.back().begin = k;
+            }
+            Cluster& last = clusters.back();
+            const float w = 1 / own.points.noise[m];
+            last.upper = z[m], last.end = k + 1, last.weight += w, last.lift += w * (z[m] - last.lower), last.number++;
+            last.above &= own.points.above[m];
+        }
+    }
+
+    // `_shows_ground`
+    bool shows_ground(const std::vector<Cluster>& clusters, float g) const {
+        const float part = 0.25f * u.min_gap;
+        bool shows = false, solid = false;
+        for (const Cluster& k : clusters) {
+            shows |= k.lower <= g + SAME && k.upper >= g - SAME && k.lower >= g - part;
+            shows |= k.upper < g - u.min_gap;
+            solid |= k.lower < g - part && k.upper >= g - u.min_gap;
+        }
+        return shows && !solid;
+    }
+
+    // Sort the points of a cell, by their places in `sorted`: `_sort_points`.
+    void sort_cell(int64_t c, int64_t begin, int64_t end, Waiting& waiting, int64_t* numbers) {
+        static thread_local std::vector<Cluster> clusters;
+        find_clusters(begin, end, clusters);
+        const int64_t p = place(c);
+        const Cell cell = cell_at(p);
+        float g = u.elevation[b * cells + c];
+        bool known = u.validity[b * cells + c];
+        const bool ground_floats = known && floats(c, g);
+        if (ground_floats && shows_ground(clusters, g)) {
+            numbers[DROPPED] += cell.insert(ground_of(c), u.ground_time[b * cells + c]);
+            numbers[OPENED]++, known = false, forget_ground(c), is_open(p) = 0;
+        }
+        for (size_t rank = 0; rank < clusters.size() && rank < size_t(2 * (u.L + 1)); rank++) {
+            const Found found = clusters[rank].found(u.variance_floor);
+            const float to_ground = known ? distance(found.lower, found.upper, g, g) : INFINITE;
+            int64_t nearest = 0;
+            float to_level = INFINITE;
+            for (int64_t l = 0; l < u.L; l++) {
+                const int64_t q = l * cells;
+                if (!(cell.support[q] > 0)) continue;
+                const float away = distance(found.lower, found.upper, cell.lower[q], cell.upper[q]);
+                if (cell.support[q] < SETTLED && away > SAME) continue;
+                if (away < to_level) to_level = away, nearest = l;
+            }
+            if (to_ground <= u.min_gap && to_ground <= to_level) continue;
+            if (to_level <= u.min_gap) {
+                const bool stands = !known && found.lower < cell.lower[nearest * cells] && !floats(c, found.lower);
+                cell.fuse(nearest, found, u.max_support);
+                if (stands) found_ground(c, nearest), known = true, g = u.elevation[b * cells + c];
+            } else {
+                const bool above = known && found.lower > g;
+                bool shown = known && !above ? ground_floats : (above && is_open(p)) || floats(c, found.lower);
+                shown |= (!known && clusters[rank].above) || (u.by_gap && (known || rank > 0));
+                if (!shown) {
+                    if (!known && !(waiting.number > 0)) waiting = {found.mean, found.number};
+                    continue;
+                }
+                numbers[DROPPED] += cell.insert(found, 0), numbers[OPENED]++;
+            }
+            for (int64_t k = clusters[rank].begin; k < clusters[rank].end; k++) u.aside[b * M + own.sorted[k]] = 1;
+        }
+    }
+};
+
+}  // namespace levels
