@@ -176,7 +176,7 @@ quality-em-cupy: setup  ## compare maps with those of elevation_mapping_cupy: GO
 
 quality-levels: setup  ## measure maps with levels in exact scenes, and their cost, ten minutes
 	$(BIN)/python -m benchmarks.quality.levels
-	$(BIN)/python -m benchmarks.quality.levels_accuracy
+	$(BIN)/python -m benchmarks.quality.levels.one_height
 	$(BIN)/python -m benchmarks.speed.levels
 	$(BIN)/python -m docs.readme_tables
 

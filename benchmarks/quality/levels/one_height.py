@@ -1,6 +1,6 @@
 """Whether levels cost accuracy where there is one height: the scenes of the accuracy table, mapped with and without.
 
-python -m benchmarks.quality.levels_accuracy     # benchmarks/results/levels_accuracy.json and a table
+python -m benchmarks.quality.levels.one_height     # benchmarks/results/levels_accuracy.json and a table
 """
 
 from __future__ import annotations

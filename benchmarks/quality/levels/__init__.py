@@ -1,0 +1,1 @@
+"""Maps with levels in exact scenes, and where there is one height."""
