@@ -41,7 +41,7 @@ struct SightGrid {
 };
 
 struct Slopes {
-    float highest, lowest;
+    float highest, fall;  // greatest, and greatest downwards: of both the larger, so that they pass as one row
 };
 
 constexpr float RISE = 0.5f;
@@ -62,17 +62,16 @@ struct Sight {
 
     void look_for_slopes(const Points& p, int64_t begin, int64_t end, const SightGrid& size) {
         const int64_t A = size.azimuths;
-        slopes.assign(int64_t(size.ranges) * A, {-INFINITE, INFINITE});
+        slopes.assign(int64_t(size.ranges) * A, {-INFINITE, -INFINITE});
         for (int64_t m = begin; m < end; m++) {
             if (!p.casts[m] || !(p.rho[m] > 0)) continue;
             Slopes& known = slopes[p.reach[m]];
-            known.highest = std::max(known.highest, p.slope[m]), known.lowest = std::min(known.lowest, p.slope[m]);
+            known.highest = std::max(known.highest, p.slope[m]), known.fall = std::max(known.fall, -p.slope[m]);
         }
         for (int64_t row = size.ranges - 3; row >= 0; row--) {  // the last row stays blank
-            Slopes* __restrict to = &slopes[row * A];
-            const Slopes* far = to + A;
-            for (int64_t k = 0; k < A; k++)
-                to[k] = {std::max(to[k].highest, far[k].highest), std::min(to[k].lowest, far[k].lowest)};
+            float* __restrict to = &slopes[row * A].highest;
+            const float* far = &slopes[(row + 1) * A].highest;
+            for (int64_t k = 0; k < 2 * A; k++) to[k] = std::max(to[k], far[k]);
         }
     }
 
@@ -155,7 +154,7 @@ struct Sights {
                 }
                 for (int64_t n = 0; n < number; n++) {
                     const float up = sight.origin[2] + sight.slopes[place[n]].highest * d[n];
-                    const float down = sight.origin[2] + sight.slopes[place[n]].lowest * d[n];
+                    const float down = sight.origin[2] - sight.slopes[place[n]].fall * d[n];
                     highest[first + n] = std::max(highest[first + n], up);
                     lowest[first + n] = std::min(lowest[first + n], down);
                 }
