@@ -8,6 +8,7 @@ For many robots, fast: height fields and courses (`terrains/`), mounted sensors 
 float32 on any device. Environments that robots act in are not here: see `envs/`.
 """
 
+from torchelev.sim.boxes import Boxes
 from torchelev.sim.errors.error_models import SensorErrorConfig, SensorErrors
 from torchelev.sim.errors.pose_error import PoseErrorConfig, PoseErrors
 from torchelev.sim.errors.presets import ErrorPreset, preset
@@ -16,7 +17,6 @@ from torchelev.sim.exact.scenes import Box, Scene
 from torchelev.sim.exact.sensors import DepthCamera, Lidar, NonRepetitiveLidar, cast
 from torchelev.sim.exact.trajectories import Trajectory, sink, turn_on_the_spot, walk
 from torchelev.sim.poses import MOUNT, mount, mount_on_rim
-from torchelev.sim.sensors.casting import Boxes
 from torchelev.sim.sensors.mounted import MountedSensor
 from torchelev.sim.terrains.course import Course, CourseConfig, make_course
 from torchelev.sim.terrains.generate import Terrain, TerrainGrid, make_terrain, terrain_grid
