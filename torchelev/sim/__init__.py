@@ -19,14 +19,16 @@ from torchelev.sim.exact.trajectories import Trajectory, sink, turn_on_the_spot,
 from torchelev.sim.poses import MOUNT, mount, mount_on_rim
 from torchelev.sim.sensors.mounted import MountedSensor
 from torchelev.sim.terrains.course import Course, CourseConfig, make_course
+from torchelev.sim.terrains.covers import CoversConfig
 from torchelev.sim.terrains.generate import Terrain, TerrainGrid, make_terrain, terrain_grid
 from torchelev.sim.terrains.heightfield import HeightField
+from torchelev.sim.terrains.structures import Structures
 from torchelev.sim.terrains.surfaces import surface_of
 
 __all__ = [
-    "MOUNT", "Box", "Boxes", "Course", "CourseConfig", "DepthCamera", "ErrorPreset", "HeightField", "Lidar",
+    "MOUNT", "Box", "Boxes", "Course", "CourseConfig", "CoversConfig", "DepthCamera", "ErrorPreset", "HeightField", "Lidar",
     "MountedSensor", "NonRepetitiveLidar", "PoseErrorConfig", "PoseErrors", "Scene", "SensorErrorConfig",
-    "SensorErrors", "Terrain", "TerrainGrid", "Trajectory", "cast", "dropout", "make_course", "make_terrain",
+    "SensorErrors", "Structures", "Terrain", "TerrainGrid", "Trajectory", "cast", "dropout", "make_course", "make_terrain",
     "mount", "mount_on_rim", "noisy", "outliers", "preset", "range_noise", "sink", "surface_of",
     "terrain_grid", "turn_on_the_spot", "walk",
 ]  # fmt: skip

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 class Structures:
     """N boxes on each of K tiles, in the tiles' frames, with their z axes vertical.
 
-    They belong to a `HeightField` of K tiles, which knows nothing of them: `boxes` gives a `MountedSensor` those of each
-    environment. A box of half size 0 is absent; it pads tiles with fewer boxes.
+    They belong to a `HeightField` of K tiles, which knows nothing of them: `boxes` gives those of each environment to a
+    `MountedSensor`. A box of half size 0 is absent; it pads tiles with fewer boxes.
 
     Raises:
         ValueError: The shapes do not fit.
