@@ -63,8 +63,8 @@ class SightConfig:
     #: what the elevation of perception "map" reads where the map is unknown, by the rules of `HeightScan`: "base" for
     #: the nominal ground below the base, "inpaint", "completed", ...; the validity always marks unknown cells
     fill: str = "base"
-    #: what the image shows of ceilings, after its four layers: "none"; "scan", a height scan of the ceiling and its mask;
-    #: "voxels", what a `VoxelCrop` finds occupied. The last two give perception "map" levels
+    #: what the image shows of ceilings, after its four layers: "none"; "scan", a height scan of the ceiling and its
+    #: mask; "voxels", what a `VoxelCrop` finds occupied. The last two give the map levels
     ceilings: str = "none"
     no_ceiling: float = 1.0  #: [m] above the base: the scan reads it where nothing hangs lower, or nobody looked
 

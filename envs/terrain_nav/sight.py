@@ -1,9 +1,9 @@
 """The perception of TerrainNav's robots: their map, the true ground with white noise, or none.
 
 Each sight returns an image (B, 4, n, n) of the same crop in the base's yaw frame: elevation and upper bound relative to
-the ground under the base [m], validity, traversability, and the channels of `ceilings.py`. Unknown pixels are 0 in all of them, but for the elevation of
-`MapSight`, which `SightConfig.fill` fills. `sense` takes a measurement and draws all random numbers;
-`image` only reads.
+the ground under the base [m], validity, traversability; the channels of `ceilings.py` follow. Unknown pixels are 0 in
+all four, but for the elevation of `MapSight`, which `SightConfig.fill` fills. `sense` takes a measurement and draws all
+random numbers; `image` only reads.
 """
 
 from __future__ import annotations

@@ -6,41 +6,20 @@ in the order of their interfaces. All state is tensors on one device.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from envs.terrain_nav.config import PERCEPTION, TerrainNavConfig
 from envs.terrain_nav.course import make_rated_course
+from envs.terrain_nav.outcome import ENDINGS, Outcome
 from envs.terrain_nav.proprioception import observe_body
 from envs.terrain_nav.robot import Ground, RobotState, advance, base_pose
 from envs.terrain_nav.sight import SIGHTS, TruthSight
 from torchelev.errors import require, require_count
 
 NUM_ACTIONS = 2  # forward speed and yaw rate
-ENDINGS = ("success", "fallen", "stuck", "truncated")  # how an episode can end
-
-
-class Outcome(NamedTuple):
-    """Result of a step for B robots."""
-
-    reward: Tensor  #: (B,)
-    success: Tensor  #: (B,) bool, whether the goal is reached
-    fallen: Tensor  #: (B,) bool, whether the robot has fallen
-    stuck: Tensor  #: (B,) bool, whether the robot has been blocked for too long
-    truncated: Tensor  #: (B,) bool, whether time has run out
-    bumped: Tensor  #: (B,) bool, whether the robot has fallen because its body met a box
-
-    @property
-    def terminated(self) -> Tensor:
-        """Whether the episode has ended by success, fall or being stuck (B,)."""
-        return self.success | self.fallen | self.stuck
-
-    @property
-    def done(self) -> Tensor:
-        """Whether the episode has ended, in any way (B,)."""
-        return self.terminated | self.truncated
 
 
 class TerrainNav(nn.Module):

@@ -8,8 +8,8 @@ import torch
 import envs.terrain_nav.task as task_module
 from envs.terrain_nav import SightConfig, TerrainNav, TerrainNavConfig
 from envs.terrain_nav.course import RatedCourse, make_rated_course
+from envs.terrain_nav.outcome import ENDINGS
 from envs.terrain_nav.robot import Ground
-from envs.terrain_nav.task import ENDINGS
 from tests.envs.terrain_nav_cases import FLAT, ROBOT, SMALL, field_of, flat
 from tests.helpers import NoGenerator
 from torchelev.sim.sensors import mounted

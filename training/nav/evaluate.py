@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from envs.terrain_nav import TerrainNav, TerrainNavConfig
-from envs.terrain_nav.task import ENDINGS
+from envs.terrain_nav.outcome import ENDINGS
 
 Policy = Callable[[Any], Tensor]
 

@@ -14,7 +14,7 @@ from envs.terrain_nav import CourseConfig, SightConfig, TerrainNav, TerrainNavCo
 from envs.terrain_nav.config import CEILINGS, PERCEPTION
 from envs.terrain_nav.rsl_rl import RslRlTerrainNav, mirror
 from torchelev.observations.fill import FILLS
-from training.nav.covered import COURSES, COVERED, covered_sight
+from training.nav.covered import COURSES, covered_course, covered_sight
 from training.nav.encoders import ENCODERS, encoder_config
 from training.nav.evaluate import evaluate, picture
 from training.nav.export import export, record
@@ -60,7 +60,7 @@ def task_config(
     seed = _HELD_OUT_SEED if held_out else _TRAIN_SEED
     if course == "open":
         return TerrainNavConfig(course=CourseConfig(seed=seed), sight=SightConfig(fill=fill, ceilings=ceilings))
-    return TerrainNavConfig(course=CourseConfig(seed=seed, covers=COVERED), sight=covered_sight(fill, ceilings))
+    return TerrainNavConfig(course=covered_course(seed), sight=covered_sight(fill, ceilings))
 
 
 def make_runner(

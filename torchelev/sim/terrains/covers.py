@@ -29,11 +29,11 @@ class CoversConfig:
         ValueError: A setting is out of range.
     """
 
-    wall_spacing: float = 3.0  #: [m] between walls
+    wall_spacing: float = 4.0  #: [m] between walls
     wall_height: float = 1.4  #: [m] of the walls over the ground
     wall_thickness: tuple[float, float] = (0.2, 0.4)  #: [m] (min, max)
     gate_spacing: float = 2.0  #: [m] between the middles of gates
-    gate_width: tuple[float, float] = (0.9, 1.1)  #: [m] (min, max)
+    gate_width: tuple[float, float] = (1.2, 1.5)  #: [m] (min, max)
     low: tuple[float, float] = (0.35, 0.52)  #: [m] (min, max) free height below what the robot does not fit under
     high: tuple[float, float] = (0.72, 1.1)  #: [m] (min, max) free height below what it fits under
     low_share: float = 0.5  #: fraction of the tables and beams that are low
