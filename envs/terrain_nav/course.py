@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import dataclasses
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -31,7 +32,7 @@ class RatedCourse(Course):
     """A course with the traversability of its ground, for a critic that sees the truth."""
 
     traversability: HeightField  #: from 0 to 1, computed from the true ground as a map computes it
-    ceilings: Ceilings | None = field(default=None, kw_only=True)  #: None for a course without structures
+    ceilings: Ceilings | None = dataclasses.field(default=None, kw_only=True)  #: None for a course without structures
 
 
 def make_rated_course(cfg: CourseConfig, device: torch.device | str = "cpu") -> RatedCourse:

@@ -8,10 +8,10 @@ and its mask, "voxels" what a `VoxelCrop` finds occupied; both have a map with l
 with white noise, and the true ceiling: no map can show more. Cameras, networks and all other settings are the same, and
 so are the critics, which see the truth.
 
-Budget and seeds were fixed before the first run: 36 iterations of 256 robots and 24 steps, at most about 6 minutes
-for a training beside other work; two seeds; 512 episodes on held-out tiles for each policy. The course and the cameras were
-chosen on the training ground with another seed. Finished trainings are kept in RUNS: after Ctrl-C, run the command
-again. Writes training/results/ceilings.json and ceilings.png.
+Budget and seeds were fixed before the first run: 36 iterations of 256 robots and 24 steps, at most about 6 minutes for
+a training beside other work; two seeds; 512 episodes on held-out tiles for each policy. Course and cameras were chosen
+on the training ground with another seed. Finished trainings are kept in RUNS: after Ctrl-C, run the command again.
+Writes training/results/ceilings.json and ceilings.png.
 """
 
 from __future__ import annotations

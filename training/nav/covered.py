@@ -15,5 +15,10 @@ def covered_course(seed: int) -> CourseConfig:
 
 def covered_sight(fill: str, ceilings: str) -> SightConfig:
     """Return the robots' sight there: their cameras look up nearly as far as down, from +40 to -50 degrees."""
-    cameras = {"camera_pixels": (16, 24), "camera_fov_deg": (90.0, 90.0), "camera_pitch_deg": 5.0}
-    return SightConfig(fill=fill, ceilings=ceilings, **cameras)
+    return SightConfig(
+        fill=fill,
+        ceilings=ceilings,
+        camera_pixels=(16, 24),
+        camera_fov_deg=(90.0, 90.0),
+        camera_pitch_deg=5.0,
+    )

@@ -6,9 +6,10 @@ be walked in a straight line.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
@@ -64,7 +65,8 @@ class Course:
     field: HeightField  #: the ground
     starts: Float[Tensor, "K R 2"]  #: [m] tile frame
     goals: Float[Tensor, "K R 2"]  #: [m] tile frame
-    structures: Structures | None = field(default=None, kw_only=True)  #: boxes over the ground, None without `covers`
+    #: boxes over the ground; None without `covers`
+    structures: Structures | None = dataclasses.field(default=None, kw_only=True)
 
 
 def make_course(cfg: CourseConfig, device: torch.device | str = "cpu") -> Course:
