@@ -114,3 +114,17 @@ def test_the_evaluation_counts_bumps_among_falls():
     cfg = TerrainNavConfig(course=COVERED, sight=covered_sight("base", "none"))
     result = evaluate(straight_line, cfg, "blind", episodes=64)
     assert 0 < result["bumped"] <= result["fallen"] and result["success"] < 0.5
+
+
+@pytest.mark.slow(1)
+def test_pictures_show_which_boxes_are_too_low():
+    from envs.terrain_nav.render import draw, snapshot
+
+    for height, counts in ((0.5, (1, 0)), (0.7, (0, 1))):
+        task = below(height)
+        shot = snapshot(task)
+        assert (len(shot.low), len(shot.high)) == counts and draw(task, 0).ndim == 3
+        outline = torch.as_tensor([*shot.low, *shot.high][0])
+        assert outline.amin(0).tolist() == pytest.approx([0.95, -0.2])
+        assert outline.amax(0).tolist() == pytest.approx([1.05, 0.2])
+    assert not len(snapshot(TerrainNav(TerrainNavConfig(course=FLAT), 1, perception="blind")).low)
