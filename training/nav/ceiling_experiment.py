@@ -94,7 +94,8 @@ def table(result: dict[str, Any]) -> str:
 
 def plot(result: dict[str, Any], path: Path) -> None:
     """Draw the success during training and when deployed."""
-    draw_success(result, "sees", NAMES, "the policy sees", path)
+    short = {"none": "none", "scan": "scan", "voxels": "voxels", "truth": "truth"}
+    draw_success(result, "sees", short, "ceilings that the policy sees", path)
 
 
 @click.command(help=__doc__)
