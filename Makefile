@@ -15,7 +15,7 @@ ISAACLAB := .venv-isaaclab
 NEWTON := .venv-newton
 GENESIS := .venv-genesis
 
-.PHONY: help wheel demo test test-fast test-library test-mjlab test-mujoco train-mjlab test-isaaclab bench-isaaclab test-newton test-genesis test-ros2 test-ros2-torch bench-ros2 matrix lint types setup bench quality quality-em-cupy quality-levels quality-odometry runtime docs clean
+.PHONY: help wheel demo test test-fast test-library test-mjlab test-mujoco train-mjlab test-isaaclab bench-isaaclab test-newton test-genesis test-ros2 test-ros2-torch bench-ros2 matrix lint types setup bench quality quality-em-cupy quality-levels quality-odometry train-ceilings runtime docs clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 12
@@ -182,6 +182,10 @@ quality-levels: setup  ## measure maps with levels in exact scenes, and their co
 
 quality-odometry: setup  ## measure maps whose poses come from the clouds, five minutes
 	$(BIN)/python -m benchmarks.quality.odometry
+	$(BIN)/python -m docs.readme_tables
+
+train-ceilings: setup  ## train policies with and without sight of ceilings, an hour of two cores
+	$(BIN)/python -m training.nav.ceiling_experiment
 	$(BIN)/python -m docs.readme_tables
 
 runtime: setup  ## measure the C library, and prove its answers on other processors and under sanitizers, half an hour

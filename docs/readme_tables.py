@@ -47,6 +47,7 @@ from benchmarks.speed import (
     loop,
     sensors,
     sight,
+    structures,
 )
 from benchmarks.speed import levels as levels_speed
 from benchmarks.speed.postprocessing import __main__ as postprocessing
@@ -55,7 +56,7 @@ from benchmarks.speed.update import tables
 from torchelev.app.results import markdown_table
 from training.completion import edges
 from training.completion import evaluate as filling
-from training.nav import encoder_experiment, experiment, fill_experiment
+from training.nav import ceiling_experiment, encoder_experiment, experiment, fill_experiment
 from training.quadruped import experiment as legs
 from training.quadruped import fills, step_time
 from training.traversability import block, evaluate
@@ -203,8 +204,10 @@ TABLES = {
     "legs_step_time": _made_by(step_time.table, "quadruped-step-time", folder=training.RESULTS),
     "encoder_success": _made_by(encoder_experiment.table, "encoders", folder=training.RESULTS),
     "fill": _made_by(fill_experiment.table, "fill", folder=training.RESULTS),
+    "ceilings": _made_by(ceiling_experiment.table, "ceilings", folder=training.RESULTS),
     "encoder_cost": _made_by(encoders.table, "encoders", "rows"),
     "sensors": _made_by(sensors.table, "sensors", "cases"),
+    "structures": _made_by(structures.table, "structures"),
     "sight": _made_by(sight.table, "sight", "rows"),
     "mjlab": _made_by(mjlab_task.table, "mjlab"),
     "channels": _made_by(channels.table, "channels"),

@@ -17,7 +17,12 @@ from torchelev.errors import message, require
 from torchelev.files.output_files import atomic_file
 from training.resume import CHECKPOINT, deferred_interrupt
 
-_DEFAULTS = {"encoder": "cnn", "fill": "base"}  # of configurations and checkpoints that name none
+_DEFAULTS = {
+    "encoder": "cnn",
+    "fill": "base",
+    "course": "open",
+    "ceilings": "none",
+}  # of configurations and checkpoints that name none
 _HINT = "use the settings that it was trained with"
 _LOGGER_STATE = ("tot_timesteps", "tot_time", "rewbuffer", "lenbuffer", "cur_reward_sum", "cur_episode_length")
 
@@ -119,7 +124,8 @@ class ResumableRunner(OnPolicyRunner):
 
         Raises:
             ValueError: the checkpoint is damaged, has other observations, weights of other sizes, another perception,
-                encoder or fill, or another number of environments or processes; nothing has changed then.
+                encoder, fill, course or ceilings, or another number of environments or processes; nothing has changed
+                then.
         """
         path = self._own(Path(path))
         saved = _read(path, self.device)

@@ -19,8 +19,8 @@ import torch
 from numpy.typing import NDArray
 
 from envs.terrain_nav import TerrainNav
+from envs.terrain_nav.outcome import ENDINGS
 from envs.terrain_nav.render import Snapshot, draw_column, snapshot, window_around
-from envs.terrain_nav.task import ENDINGS
 from torchelev.viz.style import ROBOT_COLOR, make_figure, save, styled
 from training.nav.evaluate import Policy
 from training.nav.train import task_config

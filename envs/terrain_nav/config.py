@@ -10,6 +10,7 @@ from torchelev.observations.fill import FILLS
 from torchelev.sim import CourseConfig
 
 PERCEPTION = ("map", "truth", "blind")
+CEILINGS = ("none", "scan", "voxels")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,6 +20,7 @@ class BodyConfig:
     length: float = 0.6  #: [m] of the footprint
     width: float = 0.4  #: [m] of the footprint
     body_height: float = 0.45  #: [m] of the base over the ground under its feet
+    top: float = 0.6  #: [m] highest point of the body over the ground under its feet; boxes below it are hit
     max_speed: float = 1.0  #: [m/s] forward; a third of it backward
     max_yaw_rate: float = 1.5  #: [rad/s]
     response: float = 0.2  #: [s] time constant with which the velocity follows the command
@@ -61,6 +63,10 @@ class SightConfig:
     #: what the elevation of perception "map" reads where the map is unknown, by the rules of `HeightScan`: "base" for
     #: the nominal ground below the base, "inpaint", "completed", ...; the validity always marks unknown cells
     fill: str = "base"
+    #: what the image shows of ceilings, after its four layers: "none"; "scan", a height scan of the ceiling and its
+    #: mask; "voxels", what a `VoxelCrop` finds occupied. The last two give the map levels
+    ceilings: str = "none"
+    no_ceiling: float = 1.0  #: [m] above the base: the scan reads it where nothing hangs lower, or nobody looked
 
     def __post_init__(self) -> None:
         extent = 2 * math.hypot(self.crop_length / 2 + abs(self.crop_ahead), self.crop_length / 2)
@@ -68,6 +74,8 @@ class SightConfig:
         require(extent + 2 * self.resolution <= self.window, "sight.window", rule, self.window, "enlarge it")
         rule = f"must be one of {', '.join(FILLS)}"
         require(self.fill in FILLS, "sight.fill", rule, repr(self.fill), "use base")
+        rule = f"must be one of {', '.join(CEILINGS)}"
+        require(self.ceilings in CEILINGS, "sight.ceilings", rule, repr(self.ceilings), "use none")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import torch
@@ -9,7 +10,21 @@ from torch import Tensor
 
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig
 from torchelev.pipeline import rate
-from torchelev.sim import Course, CourseConfig, HeightField, make_course
+from torchelev.sim import Course, CourseConfig, HeightField, Structures, make_course
+
+
+@dataclass(frozen=True, eq=False)
+class Ceilings:
+    """The lowest underside over the ground of each tile, on a grid."""
+
+    heights: Tensor  #: (K, n, n) [m], inf where nothing hangs
+    resolution: float  #: [m]
+
+    def height(self, tile_ids: Tensor, xy: Tensor) -> Tensor:
+        """Return the height (B, M) [m] at the samples nearest to xy (B, M, 2) [m], inf where nothing hangs."""
+        n = self.heights.shape[-1]
+        i, j = (xy / self.resolution + (n - 1) / 2).round().long().clamp(0, n - 1).unbind(-1)
+        return self.heights.flatten()[(tile_ids[:, None] * n + i) * n + j]
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,13 +32,31 @@ class RatedCourse(Course):
     """A course with the traversability of its ground, for a critic that sees the truth."""
 
     traversability: HeightField  #: from 0 to 1, computed from the true ground as a map computes it
+    ceilings: Ceilings | None = dataclasses.field(default=None, kw_only=True)  #: None for a course without structures
 
 
 def make_rated_course(cfg: CourseConfig, device: torch.device | str = "cpu") -> RatedCourse:
     """Make the course of a config and the traversability of its ground; the same config makes the same course."""
     course = make_course(cfg, device)
     traversability = HeightField(_rate(course.field), cfg.resolution)
-    return RatedCourse(course.field, course.starts, course.goals, traversability)
+    parts = (course.field, course.starts, course.goals, traversability)
+    if course.structures is None:
+        return RatedCourse(*parts)
+    ceilings = _find_ceilings(course.structures, course.field)
+    return RatedCourse(*parts, structures=course.structures, ceilings=ceilings)
+
+
+def _find_ceilings(structures: Structures, field: HeightField, stride: int = 2) -> Ceilings:
+    """Return the undersides over every second sample of the ground."""
+    count, resolution = field.heights.shape[1], field.resolution
+    axis = (torch.arange(0, count, stride, device=field.device) - (count - 1) / 2) * resolution
+    xy = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), -1).view(1, -1, 2)
+    ground = field.heights[:, ::stride, ::stride].flatten(1)
+    tiles = [
+        structures.underside(torch.full((1,), k, device=field.device), xy, ground[k : k + 1])
+        for k in range(field.num_tiles)
+    ]
+    return Ceilings(torch.cat(tiles).view(-1, len(axis), len(axis)), stride * resolution)
 
 
 def _rate(field: HeightField) -> Tensor:

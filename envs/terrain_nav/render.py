@@ -19,6 +19,7 @@ from envs.terrain_nav.task import TerrainNav
 from torchelev.viz.style import GOAL_COLOR, HEIGHTS, ROBOT_COLOR, draw_cells, make_figure, save, styled
 
 _CONTRAST = 0.6  # [m] above and below the level ground that the colours span
+_LOW_COLOR, _HIGH_COLOR = "tab:red", "tab:green"  # of boxes that the robot does not fit under, and of those it does
 _OUTLINE = (0, 1, 3, 2)  # indices of the footprint's corners in `contacts`, counted around it
 
 
@@ -33,6 +34,8 @@ class Snapshot(NamedTuple):
     xy: np.ndarray  #: (2,) [m] position of the robot
     goal: np.ndarray  #: (2,) [m]
     seconds: float  #: [s] since the episode began
+    low: np.ndarray  #: (N, 4, 2) [m] outlines of boxes that the robot does not fit under
+    high: np.ndarray  #: (M, 4, 2) [m] outlines of boxes that it fits under
 
 
 def snapshot(task: TerrainNav, env: int = 0) -> Snapshot:
@@ -42,6 +45,7 @@ def snapshot(task: TerrainNav, env: int = 0) -> Snapshot:
     emap = getattr(task.sight, "emap", None)
     x, y = (float(v) for v in (emap.center[env, :2] if emap is not None else task.xy[env]))
     radius = cfg.sight.window / 2
+    low, high = _outlines(task, env)
     return Snapshot(
         truth=field.heights[task.tile_ids[env]].cpu().numpy(),
         truth_extent=(-half, half, -half, half),
@@ -51,7 +55,23 @@ def snapshot(task: TerrainNav, env: int = 0) -> Snapshot:
         xy=task.xy[env].cpu().numpy().copy(),
         goal=task.goal[env].cpu().numpy().copy(),
         seconds=float(task.episode_length[env]) * cfg.dt,
+        low=low,
+        high=high,
     )
+
+
+def _outlines(task: TerrainNav, env: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the outlines (N, 4, 2) [m] of the boxes on a robot's tile: those too low for it, and the others."""
+    if task.course.structures is None:
+        return np.empty((0, 4, 2)), np.empty((0, 4, 2))
+    boxes = task.course.structures.boxes(task.tile_ids[env : env + 1])
+    T, half = boxes.T_map_box[0], boxes.half_size[0]
+    signs = half.new_tensor([(1, 1), (1, -1), (-1, -1), (-1, 1)])
+    corners = T[:, None, :2, 3] + (signs * half[:, None, :2]) @ T[:, :2, :2].mT
+    ground = task.course.field.height(task.tile_ids[env : env + 1], T[None, :, :2, 3])[0]
+    is_low = T[:, 2, 3] - half[:, 2] < ground + task.cfg.robot.top
+    is_there = (half > 0).all(-1)
+    return corners[is_low & is_there].cpu().numpy(), corners[~is_low & is_there].cpu().numpy()
 
 
 @styled()
@@ -107,6 +127,9 @@ def draw_column(
     image = draw_cells(axes[0], shot.truth - level, shot.truth_extent, HEIGHTS, **limits)
     seen = np.full((1, 1), np.nan) if shot.seen is None else shot.seen
     draw_cells(axes[1], seen - level, shot.seen_extent, HEIGHTS, **limits)
+    for outlines, color in ((shot.low, _LOW_COLOR), (shot.high, _HIGH_COLOR)):
+        for outline in outlines:
+            axes[0].add_patch(Polygon(outline, facecolor=color, edgecolor="black", linewidth=0.5, alpha=0.7))
     axes[0].set_title(f"{shot.seconds:.1f} s")
     for ax in axes:
         ax.plot(*np.array(walked).T, color=ROBOT_COLOR)

@@ -1,5 +1,7 @@
 """Motion of TerrainNav's base: it follows velocity commands, slows on slopes, is blocked by steps and falls off ledges.
 
+Where its body meets a box, it falls, too.
+
 This is kinematics over a height field, without a physics engine, for all environments at once.
 """
 
@@ -14,6 +16,7 @@ from torch import Tensor
 
 from envs.terrain_nav.config import BodyConfig
 from torchelev.sim.terrains.heightfield import HeightField, heights_of
+from torchelev.sim.terrains.structures import Structures
 
 
 class RobotState(NamedTuple):
@@ -24,15 +27,17 @@ class RobotState(NamedTuple):
     velocity: Tensor  #: (B, 2) forward speed [m/s], yaw rate [rad/s]
     blocked: Tensor  #: (B,) bool, whether a step that is too high blocks the robot now
     fallen: Tensor  #: (B,) bool, whether the robot has fallen
+    bumped: Tensor  #: (B,) bool, whether it has fallen because its body met a box
 
 
 class Ground:
-    """Height of the ground, and the highest ground within `reach` [m], on each tile."""
+    """Height of the ground, the highest ground within `reach` [m], and the boxes over it, on each tile."""
 
-    def __init__(self, field: HeightField, reach: float) -> None:
+    def __init__(self, field: HeightField, reach: float, structures: Structures | None = None) -> None:
         radius = max(1, round(reach / field.resolution))
         highest = F.max_pool2d(field.heights[:, None], 2 * radius + 1, 1, radius)[:, 0]
         self.field, self.highest = field, HeightField(highest, field.resolution)
+        self.structures = structures
 
 
 def contacts(xy: Tensor, yaw: Tensor, cfg: BodyConfig) -> Tensor:
@@ -82,7 +87,7 @@ def advance(
     The velocity follows the command with the time constant `response`. The speed decreases linearly with the gradient
     under the feet, to 0 at `max_slope`, but not below a fifth. A robot does not move if after the substep ground within
     `reach` of its footprint would lie `max_climb` above its feet (blocked), or if ground under its footprint would lie
-    `max_drop` below them (fallen).
+    `max_drop` below them (fallen), or if its body, from the feet to `top`, would meet a box (fallen and bumped).
 
     Args:
         state: The robots before.
@@ -119,6 +124,11 @@ def _advance_once(
     around, below = heights_of((ground.highest, ground.field), tile_ids, _place_contacts(xy, ahead, cfg))
     blocked = (around.amax(1) - support > cfg.max_climb) & ~state.fallen
     fallen = (support - below.amin(1) > cfg.max_drop) & ~blocked | state.fallen
+    bumped = state.bumped
+    if ground.structures is not None:
+        size, top = (cfg.length, cfg.width), support + cfg.top
+        meets = ground.structures.meets(tile_ids, xy, yaw, size, support, top) & ~blocked & ~fallen
+        bumped, fallen = bumped | meets, fallen | meets
     stays = blocked | fallen
     moves = ~stays[:, None]
     moved = RobotState(
@@ -127,5 +137,6 @@ def _advance_once(
         velocity=velocity * moves,
         blocked=blocked,
         fallen=fallen,
+        bumped=bumped,
     )
     return moved, torch.where(moves, below[:, :4], feet)

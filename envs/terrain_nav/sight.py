@@ -1,9 +1,9 @@
 """The perception of TerrainNav's robots: their map, the true ground with white noise, or none.
 
 Each sight returns an image (B, 4, n, n) of the same crop in the base's yaw frame: elevation and upper bound relative to
-the ground under the base [m], validity, traversability. Unknown pixels are 0 in all of them, but for the elevation of
-`MapSight`, which `SightConfig.fill` fills. `sense` takes a measurement and draws all random numbers;
-`image` only reads.
+the ground under the base [m], validity, traversability; the channels of `ceilings.py` follow. Unknown pixels are 0 in
+all four, but for the elevation of `MapSight`, which `SightConfig.fill` fills. `sense` takes a measurement and draws all
+random numbers; `image` only reads.
 """
 
 from __future__ import annotations
@@ -13,9 +13,11 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor, nn
 
+from envs.terrain_nav.ceilings import count_channels, make_reader
 from envs.terrain_nav.config import TerrainNavConfig
 from envs.terrain_nav.course import RatedCourse
-from torchelev import CompletionConfig, ElevationMap, ElevationMapConfig, GridConfig, HeightScan, MapImage
+from torchelev import CompletionConfig, ElevationMap, ElevationMapConfig, GridConfig, HeightScan, LevelsConfig, MapImage
+from torchelev.errors import require
 from torchelev.sim import DepthCamera, MountedSensor, PoseErrors, SensorErrors, mount_on_rim, preset
 from torchelev.sim.terrains.heightfield import heights_of
 
@@ -60,7 +62,8 @@ class BlindSight(nn.Module):
 
     def image(self, T_map_base: Tensor, tile_ids: Tensor) -> Tensor:
         """Return the image (B, 4, n, n)."""
-        return torch.zeros(self.num_envs, *self.crop.shape, device=self.course.field.device)
+        C, *size = self.crop.shape
+        return torch.zeros(self.num_envs, C + count_channels(self.cfg), *size, device=self.course.field.device)
 
     def get_extra_state(self) -> dict[str, Tensor]:
         """Return the state of the random number generator."""
@@ -72,7 +75,10 @@ class BlindSight(nn.Module):
 
 
 class TruthSight(BlindSight):
-    """The true ground, its heights with uniform noise drawn at each measurement, its traversability without noise."""
+    """The true ground, its heights with uniform noise drawn at each measurement, its traversability without noise.
+
+    Its ceilings have no noise.
+    """
 
     noise: Tensor
 
@@ -83,8 +89,12 @@ class TruthSight(BlindSight):
         num_envs: int,
         compiled: bool = False,
         noise: float | None = None,
+        ceilings: str | None = None,
     ) -> None:
         super().__init__(cfg, course, num_envs)
+        self.shown = cfg.sight.ceilings if ceilings is None else ceilings
+        rule, hint = "must not be voxels for the truth", "use scan, or perception map"
+        require(self.shown != "voxels", "sight.ceilings", rule, repr(self.shown), hint)
         self.amplitude = cfg.sight.truth_noise if noise is None else noise
         shape = self.crop.shape[1:]
         self.register_buffer("noise", torch.zeros(num_envs, *shape, device=course.field.device))
@@ -102,7 +112,18 @@ class TruthSight(BlindSight):
         shape = self.noise.shape
         height, traversability = heights_of((self.course.field, self.course.traversability), tile_ids, xy)
         elevation = (height - ground[:, None]).view(shape) + self.noise
-        return torch.stack([elevation, elevation, torch.ones_like(elevation), traversability.view(shape)], 1)
+        known = torch.ones_like(elevation)
+        image = torch.stack([elevation, elevation, known, traversability.view(shape)], 1)
+        if self.shown == "none":
+            return image
+        ceiling = (self._ceiling(tile_ids, xy) - T_map_base[:, 2, 3, None]).clamp(max=self.cfg.sight.no_ceiling)
+        return torch.cat([image, torch.stack([ceiling.view(shape), known], 1)], 1)
+
+    def _ceiling(self, tile_ids: Tensor, xy: Tensor) -> Tensor:
+        """Return the true ceiling (B, M) [m] at places, inf where nothing hangs."""
+        if self.course.ceilings is None:
+            return torch.full_like(xy[..., 0], torch.inf)
+        return self.course.ceilings.height(tile_ids, xy)
 
 
 def _mountings(cfg: TerrainNavConfig) -> list[Tensor]:
@@ -123,7 +144,11 @@ class MapSight(BlindSight):
         sight, device = cfg.sight, course.field.device
         grid = GridConfig(resolution=sight.resolution, length_x=sight.window, length_y=sight.window)
         completion = CompletionConfig() if sight.fill == "completed" else None
-        self.emap = ElevationMap(ElevationMapConfig(grid=grid, completion=completion), num_envs, device)
+        # Half the height of the robot: the map then tells spaces that it does not fit into from walls.
+        levels = LevelsConfig(min_gap=cfg.robot.top / 2) if sight.ceilings != "none" else None
+        map_cfg = ElevationMapConfig(grid=grid, completion=completion, levels=levels)
+        self.emap = ElevationMap(map_cfg, num_envs, device)
+        self.read_ceilings = make_reader(cfg, self.crop)
         self.filled_scan = _make_filled_scan(cfg, self.crop)
         if compiled:
             self.emap.compile()
@@ -152,12 +177,13 @@ class MapSight(BlindSight):
     def look(self, T_map_base: Tensor, tile_ids: Tensor) -> tuple[Tensor, Tensor]:
         """Return the points of the K cameras (B, K, M, 3), sensor frame, and their estimated poses (B, K, 4, 4)."""
         width, height = self.cfg.sight.camera_pixels
-        K, clouds = len(self.cameras), []
+        K, clouds, structures = len(self.cameras), [], self.course.structures
         # All at once, so that a tile is cast at by all cameras while it is in the caches: their rays are the same.
         seen = self.cameras[0](
             self.course.field,
             tile_ids.repeat(K),
             T_map_base.repeat(K, 1, 1),
+            None if structures is None else structures.boxes(tile_ids.repeat(K)),
             T_base_sensor=torch.cat([camera.T_base_sensor @ errors.mounting() for camera, errors in self._sensors()]),
         )
         for points, (camera, errors) in zip(seen.chunk(K), self._sensors(), strict=True):
@@ -174,10 +200,12 @@ class MapSight(BlindSight):
     def image(self, T_map_base: Tensor, tile_ids: Tensor) -> Tensor:
         """Return the image of the map, its elevation filled where it is unknown."""
         image = self.crop(self.emap, self.T_estimated)
-        if self.filled_scan is None:
-            return image
-        elevation, _ = self.filled_scan(self.emap, self.T_estimated)
-        return torch.cat([elevation.view_as(image[:, :1]), image[:, 1:]], 1)
+        if self.filled_scan is not None:
+            elevation, _ = self.filled_scan(self.emap, self.T_estimated)
+            image = torch.cat([elevation.view_as(image[:, :1]), image[:, 1:]], 1)
+        if self.read_ceilings is not None:
+            image = torch.cat([image, self.read_ceilings(self.emap, self.T_estimated)], 1)
+        return image
 
 
 SIGHTS: dict[str, type[BlindSight]] = {"map": MapSight, "truth": TruthSight, "blind": BlindSight}

@@ -6,40 +6,20 @@ in the order of their interfaces. All state is tensors on one device.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from envs.terrain_nav.config import PERCEPTION, TerrainNavConfig
 from envs.terrain_nav.course import make_rated_course
+from envs.terrain_nav.outcome import ENDINGS, Outcome
 from envs.terrain_nav.proprioception import observe_body
 from envs.terrain_nav.robot import Ground, RobotState, advance, base_pose
 from envs.terrain_nav.sight import SIGHTS, TruthSight
 from torchelev.errors import require, require_count
 
 NUM_ACTIONS = 2  # forward speed and yaw rate
-ENDINGS = ("success", "fallen", "stuck", "truncated")  # how an episode can end
-
-
-class Outcome(NamedTuple):
-    """Result of a step for B robots."""
-
-    reward: Tensor  #: (B,)
-    success: Tensor  #: (B,) bool, whether the goal is reached
-    fallen: Tensor  #: (B,) bool, whether the robot has fallen
-    stuck: Tensor  #: (B,) bool, whether the robot has been blocked for too long
-    truncated: Tensor  #: (B,) bool, whether time has run out
-
-    @property
-    def terminated(self) -> Tensor:
-        """Whether the episode has ended by success, fall or being stuck (B,)."""
-        return self.success | self.fallen | self.stuck
-
-    @property
-    def done(self) -> Tensor:
-        """Whether the episode has ended, in any way (B,)."""
-        return self.terminated | self.truncated
 
 
 class TerrainNav(nn.Module):
@@ -50,6 +30,7 @@ class TerrainNav(nn.Module):
     + blocked [blocked] + time + action_rate |a - a_before|^2`, with the weights of `RewardConfig`.
 
     An episode terminates when the robot reaches the goal, falls or is stuck, and is truncated after `episode_length`.
+    On a course with `covers` a robot falls, too, when its body meets a box; `Outcome.bumped` tells these falls apart.
 
     Args:
         cfg: The settings; None for the defaults.
@@ -61,7 +42,7 @@ class TerrainNav(nn.Module):
         compiled: Build what the map's updates run on at once; else the first one does.
 
     Raises:
-        ValueError: `perception` is none of the three, or `num_envs` is not positive.
+        ValueError: `perception` is none of the three, `num_envs` is not positive, or the truth should show voxels.
     """
 
     num_actions = NUM_ACTIONS
@@ -71,6 +52,7 @@ class TerrainNav(nn.Module):
     velocity: Tensor
     blocked: Tensor
     fallen: Tensor
+    bumped: Tensor
     goal: Tensor
     tile_ids: Tensor
     episode_length: Tensor
@@ -93,15 +75,18 @@ class TerrainNav(nn.Module):
         num_envs = require_count("num_envs", num_envs, "give the number of robots")
         self.cfg, self.num_envs, self.perception = cfg or TerrainNavConfig(), num_envs, perception
         self.course = make_rated_course(self.cfg.course, device)
-        self.ground = Ground(self.course.field, self.cfg.robot.reach)
+        self.ground = Ground(self.course.field, self.cfg.robot.reach, self.course.structures)
         self.generator = torch.Generator(device)
         self.sight = SIGHTS[perception](self.cfg, self.course, num_envs, compiled)
-        self.truth = TruthSight(self.cfg, self.course, num_envs, noise=0.0)
+        shown = "none" if self.course.ceilings is None else "scan"
+        self.truth = TruthSight(self.cfg, self.course, num_envs, noise=0.0, ceilings=shown)
         for name in ("xy", "velocity", "goal", "last_action"):
             self.register_buffer(name, torch.zeros(num_envs, 2, device=device))
         dtypes = {"yaw": torch.float32, "blocked_time": torch.float32, "blocked": torch.bool, "fallen": torch.bool}
         for name, dtype in {**dtypes, "tile_ids": torch.int64, "episode_length": torch.int64}.items():
             self.register_buffer(name, torch.zeros(num_envs, dtype=dtype, device=device))
+        # Each step that bumps ends its episode: nothing to save.
+        self.register_buffer("bumped", torch.zeros(num_envs, dtype=torch.bool, device=device), persistent=False)
         self.register_buffer("endings", torch.zeros(len(ENDINGS), num_envs, device=device))
         self.seed(seed)
         self.reset()
@@ -125,6 +110,8 @@ class TerrainNav(nn.Module):
     def info(self, outcome: Outcome | None) -> dict[str, Tensor]:
         """Return the distance to the goal [m], and after a step how the episode ended, each (B,)."""
         endings = {} if outcome is None else {name: getattr(outcome, name) for name in ENDINGS[:3]}
+        if outcome is not None and self.course.structures is not None:
+            endings["bumped"] = outcome.bumped
         return {"distance": self.distance, **endings}
 
     @property
@@ -155,7 +142,7 @@ class TerrainNav(nn.Module):
         yaw = torch.atan2(offset[:, 1], offset[:, 0]) + (u[2] - 0.5) * torch.pi
         for name, value in {"xy": start, "goal": goal, "yaw": yaw, "tile_ids": tile}.items():
             self._store(name, value, mask)
-        for name in ("velocity", "blocked", "fallen", "episode_length", "blocked_time", "last_action"):
+        for name in ("velocity", "blocked", "fallen", "bumped", "episode_length", "blocked_time", "last_action"):
             self._store(name, torch.zeros_like(getattr(self, name)), mask)
         self.sight.reset(mask)
 
@@ -174,7 +161,7 @@ class TerrainNav(nn.Module):
         )
         cfg, old_distance = self.cfg, self.distance
         action = action.to(self.xy.dtype).nan_to_num(0.0).clamp(-1.0, 1.0)
-        robot = RobotState(self.xy, self.yaw, self.velocity, self.blocked, self.fallen)
+        robot = RobotState(self.xy, self.yaw, self.velocity, self.blocked, self.fallen, self.bumped)
         dt = cfg.dt / cfg.substeps
         robot = advance(robot, action, self.tile_ids, self.ground, cfg.robot, dt, cfg.substeps)
         for name, value in robot._asdict().items():
@@ -197,7 +184,7 @@ class TerrainNav(nn.Module):
         reward = weight.progress * (old_distance - distance) + weight.time + weight.action_rate * change
         reward = reward + weight.success * success + weight.fall * self.fallen + weight.stuck * stuck
         reward = reward + weight.blocked * self.blocked
-        return Outcome(reward, success, self.fallen.clone(), stuck, truncated)
+        return Outcome(reward, success, self.fallen.clone(), stuck, truncated, self.bumped.clone())
 
     def sense(self, mask: Tensor | None = None) -> None:
         """Let the robots of `mask` (B,) bool, or all of them, sense the ground once from their current poses."""
@@ -212,7 +199,8 @@ class TerrainNav(nn.Module):
 
         Returns:
             "policy" (B, 12), see `observe_body`. "map" (B, 4, n, n): elevation and upper bound relative to the ground
-            under the base [m], validity, traversability. "truth" (B, 4, n, n): the same of the true ground.
+            under the base [m], validity, traversability; further channels with `SightConfig.ceilings`. "truth"
+            (B, 4, n, n): the same of the true ground, with a scan of the ceiling on a course with `covers`.
         """
         T_map_base = self.T_map_base
         policy = observe_body(T_map_base, self.goal, self.velocity, self.last_action, self.blocked_time)

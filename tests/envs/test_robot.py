@@ -11,7 +11,7 @@ from tests.envs.terrain_nav_cases import IDS, ROBOT, field_of, flat
 
 def standing(x=0.0, y=0.0, yaw=0.0):
     no = torch.zeros(1, dtype=torch.bool)
-    return RobotState(torch.tensor([[x, y]]), torch.tensor([yaw]), torch.zeros(1, 2), no, no)
+    return RobotState(torch.tensor([[x, y]]), torch.tensor([yaw]), torch.zeros(1, 2), no, no, no)
 
 
 def drive(field, action, seconds, state=None):
@@ -80,7 +80,7 @@ def test_substeps_are_steps():
     ground = Ground(field_of(lambda x, y: 0.5 * (x > 1.0) - 0.8 * (x < -1.0)), ROBOT.reach)  # a wall and a pit
     no, xy = torch.zeros(8, dtype=torch.bool), torch.linspace(-0.8, 0.8, 8)[:, None] * torch.tensor([1.0, 0.2])
     yaw = torch.pi * (xy[:, 0] < 0)  # the others face the wall
-    first = RobotState(xy, yaw, torch.tensor([[1.0, 0.3]]).repeat(8, 1), no, no)
+    first = RobotState(xy, yaw, torch.tensor([[1.0, 0.3]]).repeat(8, 1), no, no, no)
     action, ids = torch.tensor([[1.0, 0.5]]).repeat(8, 1), IDS.repeat(8)
     one_by_one, blocked = first, no
     for _ in range(6):

@@ -8,8 +8,8 @@ import torch
 import envs.terrain_nav.task as task_module
 from envs.terrain_nav import SightConfig, TerrainNav, TerrainNavConfig
 from envs.terrain_nav.course import RatedCourse, make_rated_course
+from envs.terrain_nav.outcome import ENDINGS
 from envs.terrain_nav.robot import Ground
-from envs.terrain_nav.task import ENDINGS
 from tests.envs.terrain_nav_cases import FLAT, ROBOT, SMALL, field_of, flat
 from tests.helpers import NoGenerator
 from torchelev.sim.sensors import mounted
@@ -168,7 +168,7 @@ def test_host_reads_nothing_back_from_the_device(monkeypatch, perception):
     parts = (course.field, course.starts, course.goals, course.traversability)
     moved = RatedCourse(*(part.to("meta") for part in parts))
     monkeypatch.setattr(task_module, "make_rated_course", lambda cfg, device: moved)
-    monkeypatch.setattr(task_module, "Ground", lambda field, reach: ground)
+    monkeypatch.setattr(task_module, "Ground", lambda *_: ground)
     monkeypatch.setattr(torch, "Generator", NoGenerator)
     monkeypatch.setattr(mounted, "check_pose", lambda *_: None)  # reads the cameras' mountings when they are built
     rand = torch.rand

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from envs.terrain_nav import TerrainNav, TerrainNavConfig
-from envs.terrain_nav.task import ENDINGS
+from envs.terrain_nav.outcome import ENDINGS
 
 Policy = Callable[[Any], Tensor]
 
@@ -49,14 +49,17 @@ def evaluate(
         seed: of starts, goals and noise.
 
     Returns:
-        The fraction of episodes by ending, the mean time to success [s], None without a success, and `episodes`.
+        The fraction of episodes by ending, the mean time to success [s], None without a success, and `episodes`; on a
+        course with covers also the fraction `bumped`, of falls because the body met a box.
     """
     task = TerrainNav(cfg, episodes, device, perception, seed, compiled)
     endings = torch.zeros(len(ENDINGS), episodes, dtype=torch.bool, device=device)
     seconds = torch.zeros(episodes, device=device)
+    bumped = torch.zeros(episodes, dtype=torch.bool, device=device)
     for step in range(cfg.max_episode_length):
         outcome = task.advance(policy(_observe(task)))
         going = ~endings.any(0)
+        bumped |= outcome.bumped & going
         endings |= torch.stack([getattr(outcome, name) for name in ENDINGS]) & going
         seconds = torch.where(outcome.success & going, (step + 1) * cfg.dt, seconds)
         if bool(endings.any(0).all()):
@@ -64,6 +67,8 @@ def evaluate(
         task.reset(outcome.done)
         task.sense()
     fractions = {name: float(ended.float().mean()) for name, ended in zip(ENDINGS, endings, strict=True)}
+    if cfg.course.covers is not None:
+        fractions["bumped"] = float(bumped.float().mean())
     reached = int(endings[0].sum())
     return fractions | {"seconds": float(seconds.sum()) / reached if reached else None, "episodes": episodes}
 

@@ -48,12 +48,12 @@ def record(policy: Any, cfg: TerrainNavConfig, folder: Path) -> bool:
     """Write an episode with the map in the loop beside policy.onnx.
 
     Returns:
-        False, with nothing written, if the policy reads images that are filled: `MapImage` does not fill.
+        False, with nothing written, if the policy reads images that are filled or show ceilings: no `MapImage` does.
     """
     task = TerrainNav(cfg, 1, "cpu", "map", seed=12)
     sight = task.sight
     assert isinstance(sight, MapSight)
-    if sight.filled_scan is not None:
+    if sight.filled_scan is not None or sight.read_ceilings is not None or task.course.structures is not None:
         return False
     groups: dict[str, Any] = {"policy": ENTRIES, "map": sight.crop}
     episode.record(task, sight.emap, groups, policy, lambda: (sight.T_estimated, None), folder)

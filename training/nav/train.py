@@ -11,9 +11,10 @@ import click
 import torch
 
 from envs.terrain_nav import CourseConfig, SightConfig, TerrainNav, TerrainNavConfig
-from envs.terrain_nav.config import PERCEPTION
+from envs.terrain_nav.config import CEILINGS, PERCEPTION
 from envs.terrain_nav.rsl_rl import RslRlTerrainNav, mirror
 from torchelev.observations.fill import FILLS
+from training.nav.covered import COURSES, covered_course, covered_sight
 from training.nav.encoders import ENCODERS, encoder_config
 from training.nav.evaluate import evaluate, picture
 from training.nav.export import export, record
@@ -52,10 +53,14 @@ def ppo_config(num_steps: int = 24, save_interval: int = 10, encoder: str = "cnn
     }
 
 
-def task_config(held_out: bool = False, fill: str = "base") -> TerrainNavConfig:
-    """Return the task on the training course, or on the held-out one, with a fill of `SightConfig`."""
-    course = CourseConfig(seed=_HELD_OUT_SEED if held_out else _TRAIN_SEED)
-    return TerrainNavConfig(course=course, sight=SightConfig(fill=fill))
+def task_config(
+    held_out: bool = False, fill: str = "base", course: str = "open", ceilings: str = "none"
+) -> TerrainNavConfig:
+    """Return the task on the training course, or on the held-out one, with fill and ceilings of `SightConfig`."""
+    seed = _HELD_OUT_SEED if held_out else _TRAIN_SEED
+    if course == "open":
+        return TerrainNavConfig(course=CourseConfig(seed=seed), sight=SightConfig(fill=fill, ceilings=ceilings))
+    return TerrainNavConfig(course=covered_course(seed), sight=covered_sight(fill, ceilings))
 
 
 def make_runner(
@@ -68,12 +73,13 @@ def make_runner(
     encoder: str = "cnn",
     fill: str = "base",
     config: TaskConfig = task_config,
+    **options: str,
 ) -> ResumableRunner:
-    """Return a runner with its environments, all seeded."""
+    """Return a runner with its environments, all seeded; `options` are further ones of `config`."""
     rank = int(os.environ.get("RANK", "0"))
     torch.manual_seed(seed + 1000 * rank)
-    task = TerrainNav(config(fill=fill), num_envs, device, perception, seed + 1000 * rank, compiled)
-    settings = ppo_config(encoder=encoder) | {"fill": fill}
+    task = TerrainNav(config(fill=fill, **options), num_envs, device, perception, seed + 1000 * rank, compiled)
+    settings = ppo_config(encoder=encoder) | {"fill": fill} | options
     return ResumableRunner(RslRlTerrainNav(task), settings, str(log_dir) if log_dir else None, device)
 
 
@@ -107,6 +113,20 @@ def make_runner(
     show_default=True,
     help="What the image's elevation reads where the map is unknown.",
 )
+@click.option(
+    "--course",
+    type=click.Choice(COURSES),
+    default="open",
+    show_default=True,
+    help="Open ground with blocks and pits, or covered: walls with gates, tables and beams.",
+)
+@click.option(
+    "--ceilings",
+    type=click.Choice(CEILINGS),
+    default="none",
+    show_default=True,
+    help="What the image shows of ceilings.",
+)
 @click.option("--seed", default=0, show_default=True, help="Seed of weights, starts, goals and noise.")
 @click.option("--device", default=None, help="Default: a GPU if there is one, else the CPU.")
 @click.option(
@@ -124,6 +144,8 @@ def main(
     perception: str,
     encoder: str,
     fill: str,
+    course: str,
+    ceilings: str,
     seed: int,
     device: str | None,
     out: Path,
@@ -140,11 +162,12 @@ def main(
     (1, 12) and "map" (1, 4, 16, 16). Both return actions (B, 2).
     """
     config = config or task_config
+    options = {} if (course, ceilings) == ("open", "none") else {"course": course, "ceilings": ceilings}
     device = device or (f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu")
     if device.startswith("cuda") and not torch.cuda.is_available():
         raise click.UsageError(f"--device: there is no GPU for {device}; leave --device out")
     checkpoint = checkpoint_path(out, resume)
-    runner = make_runner(num_envs, perception, seed, device, out, compiled, encoder, fill, config)
+    runner = make_runner(num_envs, perception, seed, device, out, compiled, encoder, fill, config, **options)
     if resume:
         try:
             runner.resume(checkpoint)
@@ -160,7 +183,7 @@ def main(
             raise click.ClickException(f"stopped; {checkpoint} is saved, continue with --resume") from None
     runner.close()
     if int(os.environ.get("RANK", "0")) == 0:
-        _finish(runner, out, episodes, compiled, config(held_out=True, fill=fill))
+        _finish(runner, out, episodes, compiled, config(held_out=True, fill=fill, **options))
 
 
 def _finish(runner: ResumableRunner, out: Path, episodes: int, compiled: bool, cfg: TerrainNavConfig) -> None:

@@ -12,8 +12,9 @@ from torch import Tensor
 from torchelev.errors import require
 from torchelev.inputs.checks import check_pose
 from torchelev.robot_body.shapes import RobotBody
+from torchelev.sim.boxes import Boxes
 from torchelev.sim.sensors.body_casting import cast_at_body
-from torchelev.sim.sensors.casting import Boxes, cast, see, to_points
+from torchelev.sim.sensors.casting import cast, see, to_points
 from torchelev.sim.terrains.heightfield import HeightField
 
 if TYPE_CHECKING:

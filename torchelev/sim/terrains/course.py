@@ -6,7 +6,9 @@ be walked in a straight line.
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -15,7 +17,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchelev.errors import require
+from torchelev.sim.terrains.covers import CoversConfig, Rooms, make_rooms
 from torchelev.sim.terrains.heightfield import HeightField
+from torchelev.sim.terrains.structures import Structures
 from torchelev.sim.waves import even_waves
 
 if TYPE_CHECKING:
@@ -43,6 +47,8 @@ class CourseConfig:
     distance: tuple[float, float] = (4.0, 6.0)  #: [m] from start to goal, (min, max)
     clearance: float = 0.5  #: [m] radius of the level ground around starts and goals
     num_routes: int = 256  #: pairs of start and goal on each tile
+    #: walls with gates, tables and beams in place of all other obstacles; None for none
+    covers: CoversConfig | None = None
 
     def __post_init__(self) -> None:
         gap = self.spacing - 2 * (self.half_diagonal[1] + self.jitter)
@@ -59,6 +65,8 @@ class Course:
     field: HeightField  #: the ground
     starts: Float[Tensor, "K R 2"]  #: [m] tile frame
     goals: Float[Tensor, "K R 2"]  #: [m] tile frame
+    #: boxes over the ground; None without `covers`
+    structures: Structures | None = dataclasses.field(default=None, kw_only=True)
 
 
 def make_course(cfg: CourseConfig, device: torch.device | str = "cpu") -> Course:
@@ -72,9 +80,26 @@ def make_course(cfg: CourseConfig, device: torch.device | str = "cpu") -> Course
         RuntimeError: No pair of level places lies at the wanted distance.
     """
     generator = torch.Generator().manual_seed(cfg.seed)
+    if cfg.covers is not None:
+        return _make_covered(cfg, cfg.covers, generator, device)
     heights = torch.stack([_make_tile(cfg, generator) for _ in range(cfg.num_tiles)])
     starts, goals = _draw_routes(heights, cfg, generator)
     return Course(HeightField(heights.to(device), cfg.resolution), starts.to(device), goals.to(device))
+
+
+def _make_covered(
+    cfg: CourseConfig, covers: CoversConfig, generator: torch.Generator, device: torch.device | str
+) -> Course:
+    """Make a course whose tiles are rooms, and whose routes lead from room to room."""
+    axis = _axis(cfg)
+    x, y = torch.meshgrid(axis, axis, indexing="ij")
+    rooms = [
+        make_rooms(even_waves(generator, cfg.roughness)(x, y), axis, covers, generator) for _ in range(cfg.num_tiles)
+    ]
+    starts, goals = _draw_routes(torch.stack([tile.obstacles for tile in rooms]), cfg, generator, rooms)
+    field = HeightField(torch.stack([tile.heights for tile in rooms]).to(device), cfg.resolution)
+    structures = Structures.of_tiles([tile.parts for tile in rooms], device)
+    return Course(field, starts.to(device), goals.to(device), structures=structures)
 
 
 def _axis(cfg: CourseConfig) -> Tensor:
@@ -119,8 +144,10 @@ def _obstacle(x: Tensor, y: Tensor, cfg: CourseConfig, generator: torch.Generato
     return inside * (sign * (low + (high - low) * u))
 
 
-def _draw_routes(heights: Tensor, cfg: CourseConfig, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Return starts and goals (K, R, 2) [m] on level ground, at the wanted distance from each other."""
+def _draw_routes(
+    heights: Tensor, cfg: CourseConfig, generator: torch.Generator, rooms: Sequence[Rooms | None] | None = None
+) -> tuple[Tensor, Tensor]:
+    """Return starts and goals (K, R, 2) [m] on level ground, at the wanted distance, and in different rooms."""
     radius = round(cfg.clearance / cfg.resolution)
     window = 2 * radius + 1
     highest = F.max_pool2d(heights[:, None], window, 1, radius)[:, 0]
@@ -128,17 +155,24 @@ def _draw_routes(heights: Tensor, cfg: CourseConfig, generator: torch.Generator)
     axis = _axis(cfg)
     inner = (axis.abs() <= cfg.length / 2 - _BORDER).float()
     level = ((highest - lowest) < 0.06 + 4 * cfg.roughness).float() * inner[:, None] * inner
-    pairs = [_draw_pairs(tile, axis, cfg, generator) for tile in level]
+    tiles = zip(level, rooms or [None] * len(level), strict=True)
+    pairs = [_draw_pairs(tile, axis, cfg, generator, own) for tile, own in tiles]
     return torch.stack([start for start, _ in pairs]), torch.stack([goal for _, goal in pairs])
 
 
-def _draw_pairs(level: Tensor, axis: Tensor, cfg: CourseConfig, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+def _draw_pairs(
+    level: Tensor, axis: Tensor, cfg: CourseConfig, generator: torch.Generator, rooms: Rooms | None
+) -> tuple[Tensor, Tensor]:
     """Return starts and goals (R, 2) [m] on one tile; `level` (n, n) is 1 where a route may start or end."""
     tries = 64 * cfg.num_routes
     picks = torch.multinomial(level.flatten(), 2 * tries, replacement=True, generator=generator)
     places = torch.stack([axis[picks // len(axis)], axis[picks % len(axis)]], -1).view(2, tries, 2)
     distance = torch.linalg.vector_norm(places[0] - places[1], dim=-1)
-    good = torch.nonzero((distance >= cfg.distance[0]) & (distance <= cfg.distance[1]))[:, 0]
+    fits = (distance >= cfg.distance[0]) & (distance <= cfg.distance[1])
+    if rooms is not None:
+        start, goal = torch.bucketize(places[..., 0].contiguous(), rooms.walls)
+        fits = fits & (start != goal)
+    good = torch.nonzero(fits)[:, 0]
     if not len(good):
         raise RuntimeError("course: no route of this distance has level ground at both ends; lower shares or clearance")
     chosen = good[torch.arange(cfg.num_routes) % len(good)]

@@ -9,6 +9,17 @@ struct Box {
     float half[3];      // [m] half its sides, NaN: there is no box
 };
 
+// Return whether a box is there, and no farther than `max_range` [m] from the origin of the rays.
+inline bool can_reach(const Box& box, float max_range) {
+    float square = 0;
+    for (int axis = 0; axis < 3; axis++) {
+        const float outside = __builtin_fabsf(box.start[axis]) - box.half[axis];
+        if (outside != outside) return false;
+        square += outside > 0 ? outside * outside : 0;
+    }
+    return square <= 1.001f * max_range * max_range;  // more than float32 rounds by
+}
+
 // Return the distance [m] at which rays enter the first box, infinite where they miss all.
 inline Lanes distance_to_boxes(const Box* boxes, int count, const Lanes* direction) {
     Lanes nearest = splat(__builtin_inff());

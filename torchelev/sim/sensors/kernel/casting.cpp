@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cstddef>
+#include <iterator>
 #include <vector>
 
 #include "kernels/threads.h"
@@ -42,6 +43,13 @@ void trace(const Field& field, const float* origin, const float* directions, int
                 active[l] = 0;
         }
     }
+}
+
+// Return the boxes of an environment that rays of `max_range` can reach.
+std::vector<Box> select_near(const Box* boxes, int num_boxes, float max_range) {
+    std::vector<Box> near;
+    std::copy_if(boxes, boxes + num_boxes, std::back_inserter(near), [&](const Box& box) { return can_reach(box, max_range); });
+    return near;
 }
 
 // Shorten distances to those of the nearest box.
@@ -112,7 +120,8 @@ extern "C" int cast(const float* heights, const float* bounds, const int64_t* le
             const size_t b = order[task / parts], first = b * M + task % parts * AT_A_TIME;
             const int count = std::min(AT_A_TIME, M - task % parts * AT_A_TIME);
             all.trace_from(tiles[b], origins + 3 * b, directions + 3 * first, count, distance + first);
-            if (num_boxes) stop_at_boxes(boxes + b * num_boxes, num_boxes, directions + 3 * first, count, distance + first);
+            const std::vector<Box> near = select_near(boxes + b * num_boxes, num_boxes, max_range);
+            if (!near.empty()) stop_at_boxes(near.data(), int(near.size()), directions + 3 * first, count, distance + first);
         });
     });
 }
