@@ -20,12 +20,13 @@ _VOXELS_HEIGHT = 1.2  # [m] of the voxels over the ground under the base
 def count_channels(cfg: TerrainNavConfig) -> int:
     """Return how many channels follow the layers of the image."""
     resolution = cfg.sight.crop_resolution / _FINER
-    return {"none": 0, "scan": 2, "voxels": round(_VOXELS_HEIGHT / resolution)}[cfg.sight.ceilings]
+    return {"none": 0, "scan": 2, "drop": 2, "voxels": round(_VOXELS_HEIGHT / resolution)}[cfg.sight.ceilings]
 
 
 def make_reader(cfg: TerrainNavConfig, crop: MapImage) -> Reader | None:
     """Return what reads the channels (B, C, n, n) from maps with levels at the crop's pixels; None for none."""
-    return {"none": None, "scan": _read_scan(cfg, crop), "voxels": _read_voxels(cfg)}[cfg.sight.ceilings]
+    readers = {"none": None, "scan": _read_scan(cfg, crop), "drop": _read_drop(cfg, crop), "voxels": _read_voxels(cfg)}
+    return readers[cfg.sight.ceilings]
 
 
 def _read_scan(cfg: TerrainNavConfig, crop: MapImage) -> Reader:
@@ -36,6 +37,17 @@ def _read_scan(cfg: TerrainNavConfig, crop: MapImage) -> Reader:
     def read(emap: ElevationMap, T_map_base: Tensor) -> Tensor:
         height, known = scan(emap, T_map_base)
         return torch.stack([height, known.to(height.dtype)], 1).unflatten(-1, crop.shape[1:])
+
+    return read
+
+
+def _read_drop(cfg: TerrainNavConfig, crop: MapImage) -> Reader:
+    """Return how far the ceiling lies below `no_ceiling` [m], 0 where nothing hangs, and whether it is known."""
+    scan = _read_scan(cfg, crop)
+
+    def read(emap: ElevationMap, T_map_base: Tensor) -> Tensor:
+        height, known = scan(emap, T_map_base).unbind(1)
+        return torch.stack([cfg.sight.no_ceiling - height, known], 1)
 
     return read
 

@@ -10,7 +10,7 @@ from torchelev.observations.fill import FILLS
 from torchelev.sim import CourseConfig
 
 PERCEPTION = ("map", "truth", "blind")
-CEILINGS = ("none", "scan", "voxels")
+CEILINGS = ("none", "scan", "drop", "voxels")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +64,8 @@ class SightConfig:
     #: the nominal ground below the base, "inpaint", "completed", ...; the validity always marks unknown cells
     fill: str = "base"
     #: what the image shows of ceilings, after its four layers: "none"; "scan", a height scan of the ceiling and its
-    #: mask; "voxels", what a `VoxelCrop` finds occupied. The last two give the map levels
+    #: mask; "drop", the same as heights below `no_ceiling`; "voxels", what a `VoxelCrop` finds occupied. All but "none"
+    #: give the map levels
     ceilings: str = "none"
     no_ceiling: float = 1.0  #: [m] above the base: the scan reads it where nothing hangs lower, or nobody looked
 

@@ -93,8 +93,8 @@ class TruthSight(BlindSight):
     ) -> None:
         super().__init__(cfg, course, num_envs)
         self.shown = cfg.sight.ceilings if ceilings is None else ceilings
-        rule, hint = "must not be voxels for the truth", "use scan, or perception map"
-        require(self.shown != "voxels", "sight.ceilings", rule, repr(self.shown), hint)
+        rule, hint = "must be none or scan for the truth", "use scan, or perception map"
+        require(self.shown in ("none", "scan"), "sight.ceilings", rule, repr(self.shown), hint)
         self.amplitude = cfg.sight.truth_noise if noise is None else noise
         shape = self.crop.shape[1:]
         self.register_buffer("noise", torch.zeros(num_envs, *shape, device=course.field.device))

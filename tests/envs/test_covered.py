@@ -60,7 +60,7 @@ def test_open_courses_have_no_bumps():
 
 
 @pytest.mark.slow(2)
-@pytest.mark.parametrize("ceilings, channels", [("none", 4), ("scan", 6), ("voxels", 16)])
+@pytest.mark.parametrize("ceilings, channels", [("none", 4), ("scan", 6), ("drop", 6), ("voxels", 16)])
 def test_images_have_the_channels_of_their_ceilings(ceilings, channels):
     task = TerrainNav(TerrainNavConfig(course=COVERED, sight=covered_sight("base", ceilings)), 3)
     blind = TerrainNav(TerrainNavConfig(course=COVERED, sight=covered_sight("base", ceilings)), 3, perception="blind")
@@ -89,6 +89,21 @@ def test_true_ceilings_are_those_of_the_boxes():
 
 
 @pytest.mark.slow(2)
+def test_a_drop_is_the_scan_counted_downwards():
+    images = {}
+    for ceilings in ("scan", "drop"):
+        sight = dataclasses.replace(covered_sight("base", ceilings), sensor_errors="perfect", pose_errors="perfect")
+        task = TerrainNav(TerrainNavConfig(course=COVERED, sight=sight), 16, seed=3)
+        for _ in range(3):
+            task.advance(torch.ones(16, 2))
+            task.sense()
+        images[ceilings] = task.observe()["map"]
+    assert float(images["drop"][:, 4].max()) > 0.1, "something hangs"
+    assert torch.allclose(images["drop"][:, 4], sight.no_ceiling - images["scan"][:, 4])
+    assert torch.equal(images["drop"][:, 5], images["scan"][:, 5])
+
+
+@pytest.mark.slow(2)
 def test_the_map_sees_ceilings_where_they_are():
     sight = dataclasses.replace(covered_sight("base", "scan"), sensor_errors="perfect", pose_errors="perfect")
     task = TerrainNav(TerrainNavConfig(course=COVERED, sight=sight), 32, seed=3)
@@ -102,10 +117,12 @@ def test_the_map_sees_ceilings_where_they_are():
 
 
 def test_bad_ceilings_are_refused():
-    with pytest.raises(ValueError, match="sight.ceilings: must be one of none, scan, voxels, got 'all'; use none"):
+    with pytest.raises(
+        ValueError, match="sight.ceilings: must be one of none, scan, drop, voxels, got 'all'; use none"
+    ):
         SightConfig(ceilings="all")
     cfg = TerrainNavConfig(course=FLAT, sight=SightConfig(ceilings="voxels"))
-    with pytest.raises(ValueError, match="sight.ceilings: must not be voxels for the truth"):
+    with pytest.raises(ValueError, match="sight.ceilings: must be none or scan for the truth"):
         TerrainNav(cfg, 1, perception="truth")
 
 
