@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from torchelev.kernels.cpu_build import load
 from torchelev.levels import native
+from torchelev.levels.functional import follow_drift
 from torchelev.levels.state import (
     SURFACE,
     Levels,
@@ -17,7 +18,6 @@ from torchelev.levels.state import (
     blank_levels,
     forget_space,
     move,
-    raise_by,
     remove,
     turn,
 )
@@ -103,10 +103,7 @@ class MapLevels(nn.Module):
     @torch.no_grad()
     def follow_drift(self, state: MapState) -> None:
         """Raise all surfaces as drift compensation raised the ground in an update."""
-        if self.cfg.drift is None:
-            return
-        height = state.statistics.drift_correction.float()
-        for stored, new in zip(self.stored, raise_by(self.stored, height), strict=True):
+        for stored, new in zip(self.stored, follow_drift(self.stored, state, self.cfg), strict=True):
             if new is not stored:
                 stored.copy_(new)
 
@@ -121,10 +118,8 @@ class MapLevels(nn.Module):
         self._write(levels, state.corner)
 
     def in_windows(self, state: MapState) -> Levels:
-        """Return the levels in the windows of the maps."""
-        largest = max(self.cfg.grid.height, self.cfg.grid.width)
-        shift = (state.corner - self.corner).clamp(-largest, largest)
-        return move(turn(self.stored, self.corner, to_ring=False), shift)
+        """Return the levels in the windows of a state of the maps, as `ElevationMap.forward` takes them."""
+        return move(turn(self.stored, self.corner, to_ring=False), state.corner - self.corner)
 
     def _write(self, new: Levels, corner: Tensor) -> None:
         """Store levels of windows with this corner."""
@@ -147,6 +142,6 @@ class MapLevels(nn.Module):
         levels = remove(levels, cells[:, None].expand(levels.lower.shape))
         self._write(forget_space(levels, cells), state.corner)
 
-    def view(self, state: MapState) -> View:
-        """Return what is known of all surfaces, the ground of a state of the maps included."""
-        return view(self.in_windows(state), state, self.cfg)
+    def view(self, state: MapState, levels: Levels | None = None) -> View:
+        """Return what is known of all surfaces: the ground of a state, and the others, None: the stored ones."""
+        return view(self.in_windows(state) if levels is None else levels, state, self.cfg)
