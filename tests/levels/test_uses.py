@@ -248,3 +248,22 @@ def test_bundles_refuse_what_the_c_library_lacks():
     require_heights({"above": MapImage(layers=("clearance",))})
     assert "surface" in scan_layout(scan)
     assert "surface" not in scan_layout(HeightScan.grid())
+
+
+@pytest.mark.parametrize("height", [None, 0.2])
+def test_a_space_between_half_and_all_of_the_gap_is_told_and_too_low(height):
+    emap = make_map(levels=LevelsConfig(min_gap=0.4))
+    ones = torch.ones_like(emap.elevation)
+    state = emap.state._replace(
+        validity=ones > 0, rated=ones > 0, has_normal=ones > 0, traversability=ones, support=10 * ones
+    )
+    levels = emap.levels.in_windows(state)
+    support = torch.zeros_like(levels.support)
+    support[:, 0, 28:32, 28:32] = 10.0
+    emap.load_state(state, levels._replace(lower=levels.lower + 0.3, upper=levels.upper + 0.3, support=support))
+    assert at(emap, "clearance", 0.05, 0.05) == pytest.approx(0.3)
+    cost = traversal_cost(emap, TraversalCostConfig(height=height))
+    assert torch.isinf(cost[0, 28:32, 28:32]).all()
+    assert torch.isfinite(cost).sum() == cost.numel() - 16
+    square = torch.tensor([[[[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]]])
+    assert check_footprint(emap, square, FootprintConfig(height=height)).limit.item() == Limit.CEILING

@@ -252,7 +252,7 @@ def _choose(
 ) -> tuple[Levels, MapState, Bool[Tensor, "B cells"]]:
     """Make the surface that the robot reaches first the ground, and return where it changed.
 
-    Surfaces above the ground, and all where it was hit last, do not count if they have fewer points and are not SETTLED.
+    Surfaces above the ground, and all where it was hit last, do not count with fewer points unless they are SETTLED.
     Beside levels, the points that will found the ground where it is not known stand for it.
 
     Near the robot, ground of another floor that it cannot reach becomes a level too (paper, Sec. II-F, without the

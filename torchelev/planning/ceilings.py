@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def too_low(emap: ElevationMap, height: float | None, state: MapState | None = None) -> Bool[Tensor, "B H W"] | None:
-    """Return the cells whose known clearance is less than the robot's height; None of a map without levels.
+    """Return the cells whose known clearance is less than `needed_height`; None of a map without levels.
 
     Args:
         emap: the maps.
@@ -37,13 +37,17 @@ def too_low(emap: ElevationMap, height: float | None, state: MapState | None = N
 
 
 def needed_height(emap: ElevationMap, height: float | None) -> float:
-    """Return how high what hangs above the ground must be [m]; 0 of a map without levels. Arguments as above."""
+    """Return how high what hangs above the ground must be [m]: as high as the robot, and at least `min_gap`.
+
+    A smaller space is solid to the map, which may or may not have seen it. 0 of a map without levels; arguments as
+    above.
+    """
     if emap.levels is None:
         hint = "give the map levels=LevelsConfig(), or leave it out"
         require(height is None, "height", "needs a map with levels, which knows ceilings", height, hint)
         return 0.0
     assert emap.cfg.levels is not None
-    return emap.cfg.levels.min_gap if height is None else height
+    return max(emap.cfg.levels.min_gap, 0.0 if height is None else height)
 
 
 def describe_ceiling(ceiling: float, needed: float) -> list[str]:

@@ -40,7 +40,7 @@ class FootprintConfig:
     max_unsafe: float = 0.05  #: largest accepted fraction of unsafe cells; 0 accepts no unsafe cell at all
     max_unknown: float = 0.2  #: largest accepted fraction of cells unknown or outside the window; raise for sparse maps
     max_extent: float = 1.5  #: [m] largest accepted polygon along x and y; the cost grows with its square
-    #: [m] of the robot: a footprint below a lower ceiling is not safe, on maps with levels; None: their `min_gap`
+    #: [m] of the robot: a footprint below a lower ceiling is not safe, on maps with levels; at least their `min_gap`
     height: float | None = None
 
     def __post_init__(self) -> None:
