@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 import torch
 from torch import Tensor
@@ -34,6 +34,9 @@ from torchelev.inputs.update_inputs import (
     takes_features,
 )
 from torchelev.kernels.choose import Backend, choose
+from torchelev.levels.functional import forward as update_with_levels
+from torchelev.levels.functional import require_levels
+from torchelev.levels.state import Levels
 from torchelev.maps.buffers import without_shared_memory
 from torchelev.maps.restarts import RestartableMap
 from torchelev.ops.storage import keep_freed_memory
@@ -223,32 +226,57 @@ class ElevationMap(RestartableMap):
         inputs = self._check_inputs(*given)
         return measure(*inputs, self.cfg.grid, self.cfg.sensor, self.elevation.dtype)
 
-    def forward(self, state: MapState, measurement: Measurement) -> MapState:
+    @overload
+    def forward(self, state: MapState, measurement: Measurement) -> MapState: ...
+
+    @overload
+    def forward(self, state: MapState, measurement: Measurement, levels: Levels) -> tuple[MapState, Levels]: ...
+
+    def forward(
+        self, state: MapState, measurement: Measurement, levels: Levels | None = None
+    ) -> MapState | tuple[MapState, Levels]:
         """Return the state with a measurement fused into it (paper, Fig. 2), without touching the buffers.
 
-        Differentiable in both arguments by reverse mode, also under `torch.func.grad`, `vjp` and `jacrev`.
+        Differentiable in all arguments by reverse mode, also under `torch.func.grad`, `vjp` and `jacrev`.
 
         Args:
             state: state to start from, such as `emap.state`.
             measurement: what `measure` returned.
+            levels: the other surfaces of a map with levels, `emap.levels.in_windows(state)` or what the last call
+                returned. None: the map's own sort the points, and what becomes of them is not returned.
 
         Returns:
-            The new state, which shares no memory with the arguments.
+            The new state, or the new state and levels if these are given. They share no memory with the arguments.
 
         Raises:
             NotImplementedError: under `torch.func.jvp` and `torch.func.vmap`.
             TypeError: if the state is of half precision, or the measurement of another dtype than the state.
+            ValueError: if the levels are not those of the state.
         """
         dtype, other = state.elevation.dtype, measurement.points.dtype
         require_full_precision(dtype)
         hint = "measure with a map of that dtype"
         require(other == dtype, "measurement", f"must be of the state's dtype, {dtype}", other, hint, TypeError)
-        require_reverse_mode((*state[:-1], *state.statistics, *measurement, *(self._weights or ())))
+        require_reverse_mode((*state[:-1], *state.statistics, *measurement, *(levels or ()), *(self._weights or ())))
         before, state = state, forget_completed(state) if self._writes_back else state
-        new = pipeline.forward(state, measurement, self.cfg, self._weights)
+        new, surfaces = self._fuse(state, measurement, levels)
         if self._writes_back:
             new = self._write_back(before, new)
-        return without_shared_memory(new, (*state[:-1], *state.statistics, *measurement))
+        new = without_shared_memory(new, (*state[:-1], *state.statistics, *measurement))
+        return new if levels is None or surfaces is None else (new, surfaces)
+
+    def _fuse(self, state: MapState, m: Measurement, levels: Levels | None) -> tuple[MapState, Levels | None]:
+        """Return the state after the stages, and the levels of a map that has them."""
+        run = functools.partial(pipeline.forward, cfg=self._update_cfg, weights=self._weights)
+        if levels is not None:
+            require_levels(levels, state, self.cfg)
+        if self.levels is None:
+            return run(state, m), None
+        if levels is None:
+            rule, actual = f"must be of all {self.num_envs} maps, whose levels sort the points", len(state.validity)
+            require(actual == self.num_envs, "state", rule, actual, "give the levels of the state")
+            levels = self.levels.in_windows(state)
+        return update_with_levels(levels, state, m, self.cfg, run)
 
     def _check_inputs(self, *inputs: Any) -> Inputs:
         elevation = self.elevation

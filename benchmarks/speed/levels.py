@@ -4,7 +4,7 @@
 
 All stages are on. Robots drive over rough ground as in `benchmarks.speed.workload`, or walk below a table, where a cell
 holds several surfaces. Three levels may take 1.6 times the time of one and 2.5 times the memory, and a voxel crop of
-32 x 32 x 40 for 256 robots 5 ms, on two threads. Writes benchmarks/results/levels_speed.json.
+32 x 32 x 40 for 256 robots 5 ms, or 60 ms of distances, on two threads. Writes benchmarks/results/levels_speed.json.
 """
 
 from __future__ import annotations

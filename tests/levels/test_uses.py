@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 
 import numpy as np
 import pytest
@@ -14,6 +15,8 @@ from torchelev.io.grid_map import from_grid_map, to_grid_map
 from torchelev.observations import VoxelCrop
 from torchelev.observations.scan_layout import scan_layout
 from torchelev.planning.footprint import FootprintConfig, check_footprint
+from torchelev.planning.limits import Limit
+from torchelev.planning.path_check import check_path
 from torchelev.planning.planner import plan
 from torchelev.planning.traversal_cost import TraversalCostConfig, traversal_cost
 from torchelev.runtime.bundle.groups import require_heights
@@ -142,9 +145,16 @@ def test_voxels_need_levels_and_a_window(under):
 def test_a_robot_of_half_a_metre_fits_under_a_table_of_60_cm_and_a_taller_one_does_not(under):
     emap, _ = under
     square = torch.tensor([[[[1.8, -0.2], [2.2, -0.2], [2.2, 0.2], [1.8, 0.2]]]])
-    low, tall = (check_footprint(emap, square, FootprintConfig(height=h)).safe for h in (0.5, 0.7))
-    assert low.all()
-    assert not tall.any()
+    low, tall = (check_footprint(emap, square, FootprintConfig(height=h)) for h in (0.5, 0.7))
+    assert low.safe.all()
+    assert not tall.safe.any()
+    assert (low.limit.item(), tall.limit.item()) == (Limit.NONE, Limit.CEILING)
+    assert tall.ceiling.item() == pytest.approx(0.6, abs=0.03)
+    poses = torch.tensor([[[1.6, 0.0, 0.0], [2.0, 0.0, 0.0]]])
+    (sentence,) = check_path(
+        emap, poses, square[0, 0] - torch.tensor([2.0, 0.0]), FootprintConfig(height=0.7)
+    ).explain()
+    assert re.search(r"what hangs 0\.(59|60) m above the ground is lower than the robot's 0\.70 m", sentence)
     for height, passes in ((0.5, True), (0.7, False)):
         cost = traversal_cost(emap, TraversalCostConfig(height=height))
         x, y = emap.cell_centers()[0].unbind(-1)
@@ -168,6 +178,10 @@ def test_a_height_needs_levels():
     plain = ElevationMap(ElevationMapConfig(grid=GRID))
     with pytest.raises(ValueError, match="needs a map with levels"):
         traversal_cost(plain, TraversalCostConfig(height=0.5))
+    square = torch.tensor([[[[0.2, -0.2], [0.2, 0.2], [-0.2, 0.2]]]])
+    with pytest.raises(ValueError, match="needs a map with levels"):
+        check_footprint(plain, square, FootprintConfig(height=0.5))
+    assert torch.isinf(check_footprint(plain, square).ceiling).all()
     with pytest.raises(ValueError, match="height"):
         FootprintConfig(height=-1.0)
 
@@ -234,3 +248,22 @@ def test_bundles_refuse_what_the_c_library_lacks():
     require_heights({"above": MapImage(layers=("clearance",))})
     assert "surface" in scan_layout(scan)
     assert "surface" not in scan_layout(HeightScan.grid())
+
+
+@pytest.mark.parametrize("height", [None, 0.2])
+def test_a_space_between_half_and_all_of_the_gap_is_told_and_too_low(height):
+    emap = make_map(levels=LevelsConfig(min_gap=0.4))
+    ones = torch.ones_like(emap.elevation)
+    state = emap.state._replace(
+        validity=ones > 0, rated=ones > 0, has_normal=ones > 0, traversability=ones, support=10 * ones
+    )
+    levels = emap.levels.in_windows(state)
+    support = torch.zeros_like(levels.support)
+    support[:, 0, 28:32, 28:32] = 10.0
+    emap.load_state(state, levels._replace(lower=levels.lower + 0.3, upper=levels.upper + 0.3, support=support))
+    assert at(emap, "clearance", 0.05, 0.05) == pytest.approx(0.3)
+    cost = traversal_cost(emap, TraversalCostConfig(height=height))
+    assert torch.isinf(cost[0, 28:32, 28:32]).all()
+    assert torch.isfinite(cost).sum() == cost.numel() - 16
+    square = torch.tensor([[[[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]]])
+    assert check_footprint(emap, square, FootprintConfig(height=height)).limit.item() == Limit.CEILING

@@ -147,7 +147,8 @@ def test_checks_agree_with_loops(seed):
     polygons = random_polygons(rng, emap, 12)
     cfg = FootprintConfig(min_traversability=0.48, unsafe_traversability=0.4, max_unsafe=0.35, max_unknown=0.4)
     check = check_footprint(emap, polygons, cfg)
-    assert all(bool(torch.isfinite(values).all()) for values in check)
+    assert all(bool(torch.isfinite(values).all()) for values in check._replace(ceiling=check.step))
+    assert torch.isinf(check.ceiling).all()
     layer = emap.layer("traversability").numpy()
     for b in range(2):
         for p in range(12):
@@ -229,7 +230,7 @@ def test_a_state_is_read_in_place_of_the_maps():
 def test_other_dtypes(dtype):
     emap = ground_map(0.75, dtype=dtype)
     check = check_footprint(emap, rectangle().to(dtype))
-    assert only(check) == (True, 0.75, 0.0, 0.0) and all(v.dtype == dtype for v in check[1:])
+    assert only(check) == (True, 0.75, 0.0, 0.0) and all(v.dtype == dtype for v in check[1:-1])
 
 
 # Gradients, devices ---------------------------------------------------------------------------------------------------

@@ -225,3 +225,6 @@ def test_a_footprint_reads_what_its_ground_asks():
     assert check.step.item() == pytest.approx(0.12, abs=1e-4)
     assert check.slope.item() == pytest.approx(math.atan(0.2), abs=0.05)
     assert check.clearance.item() == pytest.approx(0.1, abs=0.02)
+    assert check.limit.item() == Limit.NONE
+    steep = check_footprint(world(lambda x, y: 0.9 * x, 0.1, CLIMBER), FOOTPRINT.view(1, 1, 4, 2), ANY_GROUND)
+    assert steep.limit.item() == Limit.SLOPE

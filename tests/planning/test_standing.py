@@ -153,7 +153,8 @@ def test_batches_equal_single_maps():
             if name != "statistics":
                 getattr(single, name).copy_(value[b : b + 1])
         alone = check_footprint(single, polygons[b : b + 1], standing=polygons[b : b + 1, 0])
-        assert all(torch.equal(x[0], y[b]) for x, y in zip(alone, both, strict=True))
+        numbers = zip(alone[:-1], both[:-1], strict=True)  # the maps' limits differ
+        assert all(torch.equal(x[0], y[b]) for x, y in numbers)
         assert torch.equal(mark_standing_cells(single, polygons[b : b + 1, 0])[0], marked[b])
     assert torch.equal(
         mark_standing_cells(single, polygons[:1, 0], emap.state._replace(corner=CORNER[:1]))[0], marked[0]

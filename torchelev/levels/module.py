@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from torchelev.kernels.cpu_build import load
 from torchelev.levels import native
+from torchelev.levels.functional import follow_drift
 from torchelev.levels.state import (
     SURFACE,
     Levels,
@@ -121,10 +122,8 @@ class MapLevels(nn.Module):
         self._write(levels, state.corner)
 
     def in_windows(self, state: MapState) -> Levels:
-        """Return the levels in the windows of the maps."""
-        largest = max(self.cfg.grid.height, self.cfg.grid.width)
-        shift = (state.corner - self.corner).clamp(-largest, largest)
-        return move(turn(self.stored, self.corner, to_ring=False), shift)
+        """Return the levels in the windows of a state of the maps, as `ElevationMap.forward` takes them."""
+        return move(turn(self.stored, self.corner, to_ring=False), state.corner - self.corner)
 
     def _write(self, new: Levels, corner: Tensor) -> None:
         """Store levels of windows with this corner."""
@@ -147,6 +146,6 @@ class MapLevels(nn.Module):
         levels = remove(levels, cells[:, None].expand(levels.lower.shape))
         self._write(forget_space(levels, cells), state.corner)
 
-    def view(self, state: MapState) -> View:
-        """Return what is known of all surfaces, the ground of a state of the maps included."""
-        return view(self.in_windows(state), state, self.cfg)
+    def view(self, state: MapState, levels: Levels | None = None) -> View:
+        """Return what is known of all surfaces: the ground of a state, and the others, None: the stored ones."""
+        return view(self.in_windows(state) if levels is None else levels, state, self.cfg)

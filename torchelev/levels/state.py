@@ -52,6 +52,7 @@ def blank_levels(size: tuple[int, int, int, int], device: torch.device | str) ->
 
 def move(levels: Levels, shift: Int[Tensor, "B 2"]) -> Levels:
     """Return levels whose windows moved by whole cells; entering cells are blank."""
+    shift = shift.clamp(-max(levels.lower.shape[2:]), max(levels.lower.shape[2:]))
     layers = {f"{name}{k}": part for name in SURFACE for k, part in enumerate(getattr(levels, name).unbind(1))}
     space = {"free_top": levels.free_top, "is_open": levels.is_open}
     moved = move_layers(layers | space, shift, {"free_top": -torch.inf})

@@ -126,7 +126,8 @@ def _look_at(state: MapState, m: Measurement, slot: Tensor, inside: Tensor, cfg:
     assert cfg.levels is not None
     size, gap, S = _size(cfg), cfg.levels.min_gap, m.origin.shape[1]
     points, casts = m.points.unflatten(1, (S, -1)), m.casts.unflatten(1, (S, -1))
-    sights = [look(points[:, s], casts[:, s], m.origin[:, s], size) for s in range(S)]
+    points, origin = points.detach(), m.origin.detach()  # what rays show are choices, which have no gradients
+    sights = [look(points[:, s], casts[:, s], origin[:, s], size) for s in range(S)]
     x, y = center_offsets(state, m, cfg.grid)
     shape = state.elevation.shape
     x, y = x.expand(shape).flatten(1), y.expand(shape).flatten(1)
@@ -267,7 +268,7 @@ def _choose(
         return levels, state, torch.zeros_like(state.validity)
     waits = (points.waiting > 0) & (levels.support > 0).any(1)
     ground = torch.where(waits, points.height, state.elevation)[:, None]
-    heights = torch.cat([ground, levels.upper], 1).unflatten(2, size)
+    heights = torch.cat([ground, levels.upper], 1).unflatten(2, size).detach()
     is_dust = (state.time[:, None] <= levels.time) | (levels.lower > ground) | waits[:, None]
     rival = torch.where(waits, points.waiting, torch.where(state.validity, state.support, 0.0)).clamp(max=SETTLED)
     rival = torch.where(is_dust, rival[:, None], 0.0).clamp(min=own.least_support)

@@ -14,7 +14,9 @@ from torchelev.inputs import checks
 from torchelev.layers import LAYERS, MODES, Layer, sample_layer, sample_lowest
 from torchelev.levels import LAYERS as LEVEL_LAYERS
 from torchelev.levels import views
+from torchelev.levels.functional import require_levels
 from torchelev.levels.module import MapLevels
+from torchelev.levels.state import Levels
 from torchelev.maps.buffers import MapBuffers
 from torchelev.stages.complete import (
     COMPLETED,
@@ -117,7 +119,9 @@ class ReadableMap(MapBuffers):
         levels = () if self.levels is None else LEVEL_LAYERS
         return (*LAYERS, *(() if self.completion_net is None else COMPLETED), *levels, *channels)
 
-    def layer(self, name: str, *, state: MapState | None = None, level: int | None = None) -> Float[Tensor, "B H W"]:
+    def layer(
+        self, name: str, *, state: MapState | None = None, level: int | None = None, levels: Levels | None = None
+    ) -> Float[Tensor, "B H W"]:
         """Return a layer as a fresh tensor, NaN where unknown.
 
         - elevation [m], variance [m^2], time [s] since the last hit: unknown where never measured, or cleared.
@@ -141,31 +145,36 @@ class ReadableMap(MapBuffers):
             state: state to read; None: the map's own.
             level: read a surface's own elevation, underside, variance, time or validity: 0 is the lowest of each cell,
                 k the one with k surfaces below it. None: the ground, on which the robot stands.
+            levels: other surfaces to read, those of the state, as `forward` returns them; None: the map's own.
 
         Raises:
             KeyError: if there is no such layer.
             ValueError: if there is no such level.
         """
         if level is not None:
-            values, known = self.read_level(name, level, state)
+            values, known = self.read_level(name, level, state, levels)
             return torch.where(known, values, torch.nan)
         if name in self.cfg.channels and name not in self.layers:
             vectors, known = self.read_channel(name, state)
             return torch.where(known[..., None], vectors, torch.nan).movedim(-1, 1)
-        values, known = self.read_layer(name, state)
+        values, known = self.read_layer(name, state, levels)
         return torch.where(known, values, torch.nan)
 
-    def read_level(self, name: str, level: int, state: MapState | None = None) -> Layer:
+    def read_level(self, name: str, level: int, state: MapState | None = None, levels: Levels | None = None) -> Layer:
         """Return a layer of one surface of each cell, and where there is one; arguments and errors as of `layer`."""
         hint = "give the config levels=LevelsConfig(max_levels=3)"
         require(self.levels is not None, "level", "needs a map with levels", repr(level), hint)
-        return views.by_level(name, level, self._surfaces(state))
+        return views.by_level(name, level, self._surfaces(state, levels))
 
-    def _surfaces(self, state: MapState | None) -> views.View:
-        """Return all surfaces of the maps, with the ground of a state."""
+    def _surfaces(self, state: MapState | None, levels: Levels | None) -> views.View:
+        """Return all surfaces of the maps: the ground of a state, and the given others or the map's own."""
         assert self.levels is not None
-        self._require_all(state)
-        return self.levels.view(self.state if state is None else state)
+        ground = self.state if state is None else state
+        if levels is None:
+            self._require_all(state)
+        else:
+            require_levels(levels, ground, self.cfg)
+        return self.levels.view(ground, levels)
 
     def read_channel(
         self, name: str, state: MapState | None = None, cell: Int[Tensor, "B M"] | None = None
@@ -194,18 +203,23 @@ class ReadableMap(MapBuffers):
             hint = "leave it out, and choose the environment afterwards"
             require(actual == self.num_envs, "state", rule, actual, hint)
 
-    def load_state(self, state: MapState) -> None:
+    def load_state(self, state: MapState, levels: Levels | None = None) -> None:
         """Copy a state into the buffers, such as one that `forward` returned.
 
-        Channels keep what fits its ground, and levels their surfaces, which are no part of a state.
+        Channels keep what fits its ground.
 
         Args:
             state: state of the same grid and number of environments; its values are converted to the map's dtype.
+            levels: the other surfaces, as `forward` returned them; None: the map keeps its own.
 
         Raises:
-            ValueError: if a tensor of the state has another shape.
+            ValueError: if a tensor of the state has another shape, or the levels are not those of the state.
         """
+        if levels is not None:
+            require_levels(levels, state, self.cfg)
         super().load_state(state)
+        if levels is not None and self.levels is not None:
+            self.levels.put(levels, self.state)
         self._sync_channels()
 
     def _sync_channels(self) -> None:
@@ -215,7 +229,7 @@ class ReadableMap(MapBuffers):
         if self.channels is not None:
             self.channels.follow(self.state)
 
-    def read_layer(self, name: str, state: MapState | None = None) -> Layer:
+    def read_layer(self, name: str, state: MapState | None = None, levels: Levels | None = None) -> Layer:
         """Return a layer's values and mask, for code that computes with both; arguments and errors as of `layer`.
 
         Returns:
@@ -223,13 +237,13 @@ class ReadableMap(MapBuffers):
             known: (B, H, W) bool. Both may share memory with the map: do not write into them.
         """
         if self.filters is None or name not in self.filters:
-            return self._read_own(name, state)
-        if state is not None:
-            return self.filters.read(name, lambda source: self.read_layer(source, state), {})
+            return self._read_own(name, state, levels)
+        if state is not None or levels is not None:
+            return self.filters.read(name, lambda source: self.read_layer(source, state, levels), {})
         with torch.inference_mode(False), torch.no_grad():  # kept, and perhaps read outside of inference mode later
             return self.filters.read(name, self.read_layer, self._derived)
 
-    def _read_own(self, name: str, state: MapState | None) -> Layer:
+    def _read_own(self, name: str, state: MapState | None, levels: Levels | None) -> Layer:
         """Return a layer that no filter makes."""
         hint = self._hint_of(name)
         require(name in self._own_layers, "layer", "must be a layer's name", repr(name), hint, KeyError)
@@ -237,7 +251,7 @@ class ReadableMap(MapBuffers):
             return self._complete(state)[name]
         if name in LEVEL_LAYERS:
             assert self.cfg.levels is not None
-            return getattr(views, name)(self._surfaces(state), self.cfg.levels.min_gap)  # type: ignore[no-any-return]
+            return getattr(views, name)(self._surfaces(state, levels), self.cfg.levels.min_gap)  # type: ignore[no-any-return]
         if name not in LAYERS:
             channel = name.split(".")[0]
             values, known = self.read_channel(channel, state)
@@ -290,6 +304,7 @@ class ReadableMap(MapBuffers):
         mode: str = "bilinear",
         *,
         state: MapState | None = None,
+        levels: Levels | None = None,
     ) -> tuple[Float[Tensor, "B M"], Bool[Tensor, "B M"]]:
         """Read a layer at points. Differentiable in the state and, if bilinear, in `xy`.
 
@@ -300,6 +315,7 @@ class ReadableMap(MapBuffers):
                 carry at least half of the weight; of ceilings and clearance it takes the lowest. "nearest" reads the
                 cell that holds the point.
             state: state to read; None: the map's own.
+            levels: other surfaces to read, as of `layer`.
 
         Returns:
             values: (B, M), 0 where not valid.
@@ -315,4 +331,4 @@ class ReadableMap(MapBuffers):
         corner = (self.state if state is None else state).corner
         uv = (xy.double() / self.cfg.grid.resolution - corner[:, None]).to(self.elevation.dtype)
         sample = sample_lowest if layer in LEVEL_LAYERS else sample_layer
-        return sample(self.read_layer(layer, state), uv, self.cfg.grid, mode)
+        return sample(self.read_layer(layer, state, levels), uv, self.cfg.grid, mode)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, require_positive, whole_cells
+from torchelev.levels.state import Levels
 from torchelev.observations import patterns, presets
 from torchelev.observations.presets import PRESETS
 from torchelev.observations.scan_reading import read_scan
@@ -192,12 +193,13 @@ class HeightScan(ScanSettings):
         *,
         noise: bool | Float[Tensor, "B P"] = False,
         state: MapState | None = None,
+        levels: Levels | None = None,
     ) -> tuple[Float[Tensor, "B *rows P"], Bool[Tensor, "B *rows P"]]:
         """Read the scan of each environment.
 
-        The heights are differentiable in the state and, in bilinear mode, in T_map_base and feet; channels, which are
-        read in single cells, are constants. The first call on a device copies the pattern there: make one before you
-        capture a CUDA graph.
+        The heights are differentiable in the state and the levels and, in bilinear mode, in T_map_base and feet;
+        channels, which are read in single cells, are constants. The first call on a device copies the pattern there:
+        make one before you capture a CUDA graph.
 
         Args:
             emap: the maps.
@@ -205,6 +207,7 @@ class HeightScan(ScanSettings):
             feet: positions of the feet [m], map frame, for a scan around feet.
             noise: True adds noise; a tensor in [0, 1), as from `torch.rand`, adds the noise of these draws.
             state: the state to read; None: that of the maps.
+            levels: the other surfaces to read, as `forward` returns them, for a scan of the ceiling; None: the maps'.
 
         Returns:
             Values, and whether the elevation at each point is known, (B, P) both. With `channels` both are
@@ -216,7 +219,7 @@ class HeightScan(ScanSettings):
             ValueError, TypeError: for a wrong shape, dtype or device, or a window too small for the pattern.
             KeyError: if the maps lack one of `channels`.
         """
-        return read_scan(self, emap, T_map_base, feet, noise, state)
+        return read_scan(self, emap, T_map_base, feet, noise, state, levels)
 
     def xy(
         self, T_map_base: Float[Tensor, "B 4 4"], feet: Float[Tensor, "B K 3"] | None = None

@@ -15,6 +15,7 @@ from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, require_positive, whole_cells
 from torchelev.grid import GridConfig
 from torchelev.layers import Layer
+from torchelev.levels.state import Levels
 from torchelev.observations import image_kernel, patterns
 from torchelev.observations.channel_reading import count_rows, parse_channels, read_channels
 from torchelev.observations.fill import read_points, require_mode
@@ -89,16 +90,23 @@ class MapImage:
         object.__setattr__(self, "_pattern", Pattern(points, self.alignment))
 
     def __call__(
-        self, emap: ElevationMap, T_map_base: Float[Tensor, "B 4 4"], *, state: MapState | None = None
+        self,
+        emap: ElevationMap,
+        T_map_base: Float[Tensor, "B 4 4"],
+        *,
+        state: MapState | None = None,
+        levels: Levels | None = None,
     ) -> Float[Tensor, "B C H W"]:
         """Read an image around the base of each environment.
 
-        Its layers are differentiable in the state and, in bilinear mode, in T_map_base; channels are constants.
+        Its layers are differentiable in the state and the levels and, in bilinear mode, in T_map_base; channels are
+        constants.
 
         Args:
             emap: the maps.
             T_map_base: base poses, in float64 far from the origin.
             state: the state to read; None: that of the maps.
+            levels: the other surfaces to read, as `forward` returns them; None: the maps'.
 
         Returns:
             A fresh tensor without NaN.
@@ -111,7 +119,7 @@ class MapImage:
         self._pattern.require_inside(grid)
         T_map_base = check_base(emap, T_map_base)
         current = emap.state if state is None else state
-        layers = {name: emap.read_layer(name, state) for name in self._read_alone}
+        layers = {name: emap.read_layer(name, state, levels) for name in self._read_alone}
         if "clearance" in layers:
             clearance, known = layers["clearance"]
             layers["clearance"] = clearance.clamp(max=self.max_clearance), known

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
 from torchelev.layers import Layer, sample_lowest
+from torchelev.levels.state import Levels
 from torchelev.observations.channel_reading import read_channels
 from torchelev.observations.fill import ORIGINAL, Query, fill_unknown, filled_layers, read_points
 from torchelev.observations.inputs import ScanInputs, check_base, check_feet, draw_noise
@@ -29,6 +30,7 @@ def read_scan(
     feet: Tensor | None,
     noise: bool | Tensor,
     state: MapState | None,
+    levels: Levels | None,
 ) -> Layer:
     """Read the values of a scan, (B, P) or with channels (B, 1 + C, P), and where they are known: see `HeightScan`."""
     scan.placement.require_inside(emap.cfg.grid)
@@ -42,7 +44,7 @@ def read_scan(
     inputs = ScanInputs(current, emap.cfg.grid, T_map_base, feet, draws)
     fill = scan.original if scan.fill == ORIGINAL else scan.fill
     if scan.surface == "ceiling":
-        heights = _read_ceiling(scan, emap, inputs, state)
+        heights = _read_ceiling(scan, inputs, emap.read_layer("ceiling", state, levels))
     elif can_read(fill, inputs):
         heights = read_in_cpp(scan, fill, _value_of_unknown(scan, fill), inputs)
     else:
@@ -62,9 +64,9 @@ def _place(scan: ScanSettings, inputs: ScanInputs) -> Float[Tensor, "B P 2"]:
     return scan.placement.place(inputs.T_map_base, origin, state.corner, inputs.grid.resolution, state.elevation.dtype)
 
 
-def _read_ceiling(scan: ScanSettings, emap: ElevationMap, inputs: ScanInputs, state: MapState | None) -> Layer:
+def _read_ceiling(scan: ScanSettings, inputs: ScanInputs, layer: Layer) -> Layer:
     """Read the heights of the ceiling above the base or the feet."""
-    ceiling, known = sample_lowest(emap.read_layer("ceiling", state), _place(scan, inputs), inputs.grid, scan.mode)
+    ceiling, known = sample_lowest(layer, _place(scan, inputs), inputs.grid, scan.mode)
     origin = inputs.T_map_base[:, None, :3, 3] if inputs.feet is None else inputs.feet
     z = origin[..., 2:].to(ceiling.dtype).expand(-1, -1, len(scan.pattern)).flatten(1)
     known = known & torch.isfinite(z)

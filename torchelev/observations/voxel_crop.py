@@ -147,6 +147,8 @@ class VoxelCrop:
     def _measure_distances(self, states: UInt8[Tensor, "B X Y Z"]) -> Float[Tensor, "B X Y Z"]:
         """Return the signed distances, from squared distances axis by axis (Felzenszwalb and Huttenlocher, 2012)."""
         reach = math.ceil(self.max_distance / self.resolution)
+        if voxel_kernel.can_measure(states):
+            return voxel_kernel.measure_distances(states, OCCUPIED, reach, self.resolution, self.max_distance)
         occupied = states == OCCUPIED
         to_occupied, to_other = (_nearest(mask, reach) for mask in (occupied, ~occupied))
         distance = torch.where(occupied, -to_other, to_occupied) * self.resolution

@@ -1,4 +1,4 @@
-"""Voxels in C++ (`voxels.cpp`), for float32 maps on a CPU: as by tensors (`voxel_crop.py`)."""
+"""Voxels in C++ (`voxels.cpp`), on a CPU and of float32 maps: as by tensors (`voxel_crop.py`)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torchelev.ops.transforms import can_compute_unseen
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
-    from jaxtyping import UInt8
+    from jaxtyping import Float, UInt8
 
 LIBRARY: tuple[str, dict[str, str]] = ("observations/kernel/voxels.cpp", {})
 _GROUND = ("elevation", "upper_bound", "validity", "bounded")
@@ -31,6 +31,17 @@ class _Voxels(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in (*_GROUND, *_LEVELS, "voxels")),
         *((name, ctypes.c_int64) for name in "LZ"),
         *((name, ctypes.c_float) for name in ("step", "offset", "min_support")),
+    )
+
+
+class _Distances(ctypes.Structure):
+    """`Voxels` of distances.h."""
+
+    _fields_ = (
+        *((name, ctypes.c_void_p) for name in ("states", "distances")),
+        *((name, ctypes.c_int64) for name in ("B", "X", "Y", "Z", "reach")),
+        *((name, ctypes.c_float) for name in ("step", "max_distance")),
+        ("occupied", ctypes.c_uint8),
     )
 
 
@@ -67,3 +78,22 @@ def read_voxels(
     settings = _Voxels(place, *ground, *stored, voxels.data_ptr(), *numbers)
     call(library.read_voxels, ctypes.byref(settings), torch.get_num_threads())
     return voxels
+
+
+def can_measure(states: Tensor) -> bool:
+    """Return whether `measure_distances` takes the states of voxels."""
+    return can_compute_unseen([states]) and load(*LIBRARY) is not None
+
+
+def measure_distances(
+    states: UInt8[Tensor, "B X Y Z"], occupied: int, reach: int, step: float, max_distance: float
+) -> Float[Tensor, "B X Y Z"]:
+    """Return the signed distances [m] to the voxels of a state, what `VoxelCrop` measures by tensors."""
+    library = load(*LIBRARY)
+    assert library is not None
+    states = states.contiguous()
+    distances = torch.empty(states.shape)
+    sizes = (*states.shape, min(reach, sum(states.shape[1:])))  # nothing is farther
+    settings = _Distances(states.data_ptr(), distances.data_ptr(), *sizes, step, max_distance, occupied)
+    call(library.measure_distances, ctypes.byref(settings), torch.get_num_threads())
+    return distances

@@ -12,14 +12,14 @@ from torch import Tensor
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, require_positive
 from torchelev.inputs.checks import given_or_default
-from torchelev.planning.ceilings import too_low
-from torchelev.planning.ground_below import fit_below, read_ground, read_patches
-from torchelev.planning.limits import ROUNDING, limits_of
+from torchelev.planning.ceilings import lowest_ceiling, needed_height
+from torchelev.planning.ground_below import fit_below, read_ground
+from torchelev.planning.limits import ROUNDING, Limit, first_limit, limits_of
 from torchelev.planning.polygons import convex_hull
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
+    from jaxtyping import Bool, Float, Int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +40,7 @@ class FootprintConfig:
     max_unsafe: float = 0.05  #: largest accepted fraction of unsafe cells; 0 accepts no unsafe cell at all
     max_unknown: float = 0.2  #: largest accepted fraction of cells unknown or outside the window; raise for sparse maps
     max_extent: float = 1.5  #: [m] largest accepted polygon along x and y; the cost grows with its square
-    #: [m] of the robot: a footprint below a lower ceiling is not safe, on maps with levels; None: their `min_gap`
+    #: [m] of the robot: a footprint below a lower ceiling is not safe, on maps with levels; at least their `min_gap`
     height: float | None = None
 
     def __post_init__(self) -> None:
@@ -65,6 +65,8 @@ class FootprintCheck(NamedTuple):
     step: Float[Tensor, "B P"]  #: [m] the highest step of a cell, as of `limits.compute_steps`
     slope: Float[Tensor, "B P"]  #: [rad] inclination of the plane through the known cells
     clearance: Float[Tensor, "B P"]  #: [m] height of the highest known cell above the plane through the outer ones
+    ceiling: Float[Tensor, "B P"]  #: [m] height of the lowest ceiling above the ground; infinite where none is known
+    limit: Int[Tensor, "B P"]  #: the first `limits.Limit` of the robot that is exceeded; 0: none
 
 
 def check_footprint(
@@ -83,7 +85,7 @@ def check_footprint(
 
     Nor may the ground exceed the robot's limits, however well it is rated (`limits.limits_of`): no cell has a higher
     step, the plane through the known cells is not steeper, and no cell is higher above the outer ones than the belly.
-    On maps with levels, the robot fits below the ceiling of every cell.
+    On maps with levels, the robot fits below the ceiling of every cell. `limit` names the first one that is exceeded.
 
     The paper's open code offers planners a similar check. It crops polygons at the window's border, ignores unknown
     cells and bounds the number of unsafe cells; here cells outside the window and unknown cells count as unknown, and
@@ -109,8 +111,7 @@ def check_footprint(
     ground = read_ground(emap, polygons, cfg.layer, cfg.max_extent, state, standing)
     values = ground.values
     is_unsafe = ground.known & (values < cfg.unsafe_traversability)
-    low = too_low(emap, cfg.height, state)
-    is_low = torch.zeros_like(is_unsafe) if low is None else read_patches(low, low, ground.cells, emap.cfg.grid)[1]
+    ceiling = lowest_ceiling(emap, ground.cells, state)
     masks = (ground.cells.inside, ground.known, is_unsafe, ground.assumed)
     total, known, unsafe, assumed = (mask.flatten(-2).sum(-1, dtype=torch.int32) for mask in masks)
     mean = values.flatten(-2).sum(-1) / known.clamp(min=1).to(values.dtype)
@@ -120,9 +121,11 @@ def check_footprint(
     has_few_bad_cells = (unsafe_fraction <= cfg.max_unsafe) & (unknown_fraction <= cfg.max_unknown)
     has_good_mean = torch.where(known > 0, mean >= cfg.min_traversability, assumed > 0)
     ground_values = (ground.steps.flatten(-2).amax(-1), *fit_below(ground, emap.cfg.grid.resolution))
-    step, slope, clearance = limits_of(emap.cfg).exceeded(*ground_values)
-    safe = has_few_bad_cells & has_good_mean & ~(step | slope | clearance | is_low.flatten(-2).any(-1))
-    return FootprintCheck(safe, mean, unknown_fraction, unsafe_fraction, *(v.to(mean.dtype) for v in ground_values))
+    beyond = (*limits_of(emap.cfg).exceeded(*ground_values), ceiling < needed_height(emap, cfg.height) - ROUNDING)
+    limit = first_limit(dict(zip((Limit.STEP, Limit.SLOPE, Limit.CLEARANCE, Limit.CEILING), beyond, strict=True)))
+    safe = has_few_bad_cells & has_good_mean & (limit == Limit.NONE)
+    step, slope, clearance, above = (value.to(mean.dtype) for value in (*ground_values, ceiling))
+    return FootprintCheck(safe, mean, unknown_fraction, unsafe_fraction, step, slope, clearance, above, limit)
 
 
 def unsafe_area(

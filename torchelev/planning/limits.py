@@ -19,7 +19,7 @@ from torchelev.robot import RobotConfig
 from torchelev.traversability.heads import LearnedTraversabilityConfig, TraversabilityConfig, find_steps, step_cells
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
+    from jaxtyping import Bool, Float, Int
 
     from torchelev.config import ElevationMapConfig
     from torchelev.state import MapState
@@ -82,6 +82,14 @@ def limits_of(cfg: ElevationMapConfig) -> Limits:
         return Limits(head.robot.step_height, head.robot.max_slope, head.robot.clearance)
     assert isinstance(head, TraversabilityConfig)
     return Limits(head.critical_step, head.critical_slope)
+
+
+def first_limit(exceeded: dict[Limit, Bool[Tensor, "..."]]) -> Int[Tensor, "..."]:
+    """Return the first `Limit` that is exceeded, int64; NONE where none is."""
+    limit = torch.zeros_like(exceeded[Limit.STEP], dtype=torch.int64)
+    for which in sorted(exceeded, reverse=True):
+        limit = torch.where(exceeded[which], which.value, limit)
+    return limit
 
 
 def find_exceeded(state: MapState, cfg: ElevationMapConfig) -> list[Bool[Tensor, "B H W"]]:

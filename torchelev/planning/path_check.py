@@ -12,6 +12,7 @@ from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, require_count
 from torchelev.inputs.checks import given_or_default
 from torchelev.ops.transforms import is_readable
+from torchelev.planning.ceilings import describe_ceiling, needed_height
 from torchelev.planning.footprint import FootprintCheck, FootprintConfig, check_footprint
 from torchelev.planning.limits import Limits, limits_of
 from torchelev.planning.standing import MAX_CELL_OFFSET, check_polygon, check_poses, transform_polygon
@@ -31,6 +32,7 @@ class PathCheck(NamedTuple):
     poses: Float[Tensor, "B M 3"]  #: x, y [m] and yaw [rad], map frame; every `samples`-th is a given pose
     footprints: FootprintCheck  #: (B, M), at these places
     limits: Limits  #: of the robot, which hold besides the thresholds
+    height: float = 0.0  #: [m] of the robot, which what hangs above the ground must leave; 0 on maps without levels
 
     def explain(self) -> list[str]:
         """Say for each path whether it is safe, else why not. The host waits for the device.
@@ -47,9 +49,9 @@ class PathCheck(NamedTuple):
         if is_empty:
             return "the path is empty: no path was found; Path.explain() says why"
         x, y, _ = self.poses[b, sample].tolist()
-        mean, unknown, unsafe, *asked = (float(values[b, sample]) for values in self.footprints[1:])
+        mean, unknown, unsafe, *asked, ceiling, _ = (float(values[b, sample]) for values in self.footprints[1:])
         ground = f"mean traversability {mean:.2f}, {unsafe:.0%} of the cells unsafe, {unknown:.0%} unknown"
-        ground = "; ".join([*self.limits.describe(*asked), ground])
+        ground = "; ".join([*self.limits.describe(*asked), *describe_ceiling(ceiling, self.height), ground])
         return f"pose {pose} cannot be reached safely: at x = {x:.2f} m, y = {y:.2f} m {ground}"
 
 
@@ -109,7 +111,8 @@ def check_path(
     is_close = (step <= 1 + ROUNDING).repeat_interleave(samples, 1)
     safe = footprints.safe & torch.cat([is_close.new_ones(len(is_close), 1), is_close], 1)
     first_unsafe = _find_first_unsafe(safe, samples)
-    return PathCheck(safe.all(1), first_unsafe, places, footprints._replace(safe=safe), limits_of(emap.cfg))
+    footprints, height = footprints._replace(safe=safe), needed_height(emap, cfg.height)
+    return PathCheck(safe.all(1), first_unsafe, places, footprints, limits_of(emap.cfg), height)
 
 
 def count_samples(

@@ -53,7 +53,7 @@ class TraversalCostConfig:
     class_costs: Costs = field(default_factory=dict, hash=False)
     max_forbidden: float = 0.3  #: probability of forbidden classes, together, above which ground is impassable
     unknown_class_cost: float = 1.0  #: factor on the cost of ground whose class is unknown
-    #: [m] of the robot: ground below a lower ceiling is impassable, on maps with levels; None: their `min_gap`
+    #: [m] of the robot: ground below a lower ceiling is impassable, on maps with levels; at least their `min_gap`
     height: float | None = None
 
     def __post_init__(self) -> None:

@@ -2,6 +2,7 @@
 
 #include <cstring>
 
+#include "observations/kernel/distances.h"
 #include "observations/kernel/image_of_robot.h"
 
 namespace {
@@ -104,5 +105,17 @@ extern "C" int read_voxels(const Voxels* voxels, int num_threads) {
     return code_of([&] {
         const auto make = [&] { return Columns(*voxels); };
         for_each(int(voxels->place.B), num_threads, make, [](int64_t b, Columns& columns) { columns.fill(b); });
+    });
+}
+
+template <class T> void measure_all(const distances::Voxels& all, int num_threads) {
+    const auto make = [&] { return distances::Field<T>(all); };
+    for_each(int(all.B), num_threads, make, [](int64_t b, distances::Field<T>& field) { field.measure(b); });
+}
+
+extern "C" int measure_distances(const distances::Voxels* voxels, int num_threads) {
+    return code_of([&] {
+        if (voxels->reach < 182) measure_all<uint16_t>(*voxels, num_threads);  // two squares fit
+        else measure_all<uint32_t>(*voxels, num_threads);
     });
 }

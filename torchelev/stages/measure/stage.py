@@ -221,6 +221,12 @@ def measure(
     )
 
 
+def set_aside(m: Measurement, aside: Bool[Tensor, "B M"]) -> Measurement:
+    """Return the measurement without points on other surfaces than the ground, as if `measure` had got `aside`."""
+    used = m.used & ~aside
+    return m._replace(used=used, rejected_overhang=m.rejected_overhang + count(m.used) - count(used))
+
+
 def on_links(
     sensed: SensorPoints, T_map_sensor: Tensor, T_map_base: Tensor, T_base_links: Tensor, body: RobotBody
 ) -> Bool[Tensor, "B S N"]:
