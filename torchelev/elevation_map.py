@@ -60,7 +60,7 @@ class ElevationMap(RestartableMap):
     Args:
         cfg: configuration of all stages; None: the defaults.
         num_envs: number of maps, B.
-        device: device of the maps; `.to()` moves them.
+        device: device of the maps; `emap.to(device)` moves them.
         check_values: also check the values of poses, tensor `dt` and ids that lie on another device than the CPU, for
             which the host waits. Without, an environment whose pose is not finite ignores its points and keeps its
             window, and a `dt` that is negative or not finite counts as 0.

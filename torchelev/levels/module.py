@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from torchelev.kernels.cpu_build import load
 from torchelev.levels import native
-from torchelev.levels.functional import follow_drift
 from torchelev.levels.state import (
     SURFACE,
     Levels,
