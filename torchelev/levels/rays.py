@@ -165,7 +165,7 @@ def raise_free_top(
 
     Args:
         free_top: known before (B, cells) [m]; -inf: nothing.
-        floor: (B, cells) [m]; NaN: not known, and nothing is raised.
+        floor: (B, cells) [m] of known ground, else the lowest point or ray; inf: nothing is raised.
         sights: what the rays of each sensor saw.
         x: centres of the cells (B, cells) [m].
         y: centres of the cells (B, cells) [m].

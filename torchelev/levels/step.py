@@ -99,7 +99,8 @@ def update_levels(levels: Levels, state: MapState, m: Measurement, cfg: Elevatio
     highest, lowest = scan.rays
     is_firm = state.validity & (state.support >= own.least_support)
     opens = is_firm & (lowest < state.elevation + 0.5 * own.min_gap) & (highest >= state.elevation + own.min_gap)
-    floor = torch.where(state.validity, state.elevation, torch.nan)
+    points_floor = in_cells(scan.clusters.lower, scan.clusters, 0, grid.num_cells, torch.inf)
+    floor = torch.where(state.validity, state.elevation, torch.minimum(points_floor, lowest))
     given = scan.sights, scan.x, scan.y, own.min_gap, _size(cfg)
     levels = levels._replace(free_top=raise_free_top(levels.free_top, floor, *given), is_open=levels.is_open | opens)
     levels, state, changed = _choose(points._replace(levels=levels), m, scan, cfg)

@@ -126,9 +126,11 @@ struct MapUpdate : levels::Choice {
     void raise_free_top(const Space& space, int64_t first, float* top, int64_t number) const {
         const float step = levels::RISE * float(u.resolution);
         for (int64_t n = 0; n < number; n++) {
-            const float floor = space.ground[n];
-            if (!space.known[n] || !(space.high[n] > std::max(top[n], floor) + step)) continue;  // mostly
+            if (!(space.high[n] > top[n] + step)) continue;  // mostly
             const int64_t c = first + n;
+            const float lowest = own.number[c] ? std::min(own.bottom[c], space.low[n]) : space.low[n];
+            const float floor = space.known[n] ? space.ground[n] : lowest;
+            if (!(space.high[n] > floor + step)) continue;
             for (const levels::Sight& sight : own.sights)
                 top[n] = sight.raise_free_top(top[n], floor, own.x[c / u.W], own.y[c % u.W], u.min_gap, sights.size);
         }
