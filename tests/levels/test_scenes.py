@@ -11,6 +11,8 @@ from torchelev.observations import VoxelCrop
 from torchelev.sim.exact import covered_scenes
 from torchelev.sim.exact.covered_scenes import RISE, RUN
 from torchelev.sim.exact.scenes import Box, Scene, block, boxes, flat
+from torchelev.sim.exact.sensors import Lidar
+from torchelev.sim.poses import pose
 
 
 @pytest.fixture(scope="module")
@@ -148,3 +150,17 @@ def test_rays_over_a_beam_do_not_make_the_space_within_free():
     states = crop(emap, T)[0, 0, 0].tolist()  # from 0.5 m below the ground to 1.5 m above it
     assert states[7:11] == [0, 0, 0, 0], "below the beam rays passed"
     assert 0 not in states[15:17], "rays over the beam say nothing of what is below them"
+
+
+def test_a_ceiling_over_unseen_floor_is_no_ground():
+    emap = make_map()
+    hall = Scene(boxes=(Box(low=(-9.0, -9.0, 2.5), high=(9.0, 9.0, 2.7)),))
+    lidar = Lidar(rings=48, azimuths=256, fov_low_deg=-15.0, fov_high_deg=80.0, max_range=12.0)
+    T = pose(torch.tensor([0.0, 0.0, 0.6], dtype=torch.float64), 0.0)
+    for k in range(6):
+        points = lidar.cast(hall, T)
+        points = points + 0.02 * torch.randn(points.shape, generator=torch.Generator().manual_seed(k))
+        emap.update(points[None].float(), T[None], dt=0.2)
+    near = emap.cell_centers()[0].norm(dim=-1) < 1.5
+    assert int(torch.isfinite(emap.layer("elevation", level=0)[0][near]).sum()) > 100, "the ceiling was seen"
+    assert not torch.isfinite(emap.layer("elevation")[0][near]).any(), "and the floor was not"

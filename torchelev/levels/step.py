@@ -172,7 +172,7 @@ def _sort_points(levels: Levels, state: MapState, scan: _Scan, cfg: ElevationMap
             shown = shown | known | (rank > 0)
         opens = (there > 0) & ~to_ground & ~to_level & (shown | (ramp & ~known))
         chosen = torch.zeros_like(levels.support, dtype=torch.bool).scatter(1, nearest[:, None], to_level[:, None])
-        stands = to_level & ~known & (found.lower < levels.lower.gather(1, nearest[:, None])[:, 0]) & ~flies
+        stands = to_level & ~known & ~ramp & ~flies & (found.lower < levels.lower.gather(1, nearest[:, None])[:, 0])
         levels = fuse(levels, chosen, found, cfg.fusion.max_support)
         levels, state = found_ground(levels, state, torch.where(stands, nearest, NONE))
         waits = (there > 0) & ~to_level & ~opens & ~known & (waiting == 0)

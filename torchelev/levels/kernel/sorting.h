@@ -131,7 +131,7 @@ struct Sorting : Scan {
             }
             if (to_ground <= u.min_gap && to_ground <= to_level) continue;
             if (to_level <= u.min_gap) {
-                const bool stands = !known && found.lower < cell.lower[nearest * cells] && !floats(c, found.lower);
+                const bool stands = !known && !clusters[rank].above && found.lower < cell.lower[nearest * cells] && !floats(c, found.lower);
                 cell.fuse(nearest, found, u.max_support);
                 if (stands) found_ground(c, nearest), known = true, g = u.elevation[b * cells + c];
             } else {
