@@ -144,8 +144,9 @@ def ray_heights(sights: list[Sight], x: Tensor, y: Tensor, size: SightGrid) -> R
         d, z = horizontal(dx, dy), sight.origin[:, 2, None]
         row = (d / size.resolution + MARGIN).to(torch.int64).clamp(max=size.ranges - 1)
         place = row * size.azimuths + azimuth_bin(dx, dy, size)
-        highest = torch.maximum(highest, z + sight.highest.gather(1, place) * d)
-        lowest = torch.minimum(lowest, z + sight.lowest.gather(1, place) * d)
+        up, down = (slopes.gather(1, place) * d for slopes in (sight.highest, sight.lowest))
+        highest = torch.maximum(highest, z + up.nan_to_num(nan=-torch.inf, posinf=torch.inf, neginf=-torch.inf))
+        lowest = torch.minimum(lowest, z + down.nan_to_num(nan=torch.inf, posinf=torch.inf, neginf=-torch.inf))
     return RayHeights(highest, lowest)
 
 

@@ -1,4 +1,4 @@
-// Making the surface that the robot reaches first the ground: `_choose`.
+// Making the surface that the robot reaches first the ground: `choose_surfaces`.
 #pragma once
 
 #include "levels/kernel/sorting.h"

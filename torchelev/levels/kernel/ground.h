@@ -14,7 +14,7 @@ namespace levels {
 
 constexpr float SLOPE = 0.5f, NEAR = 1.0f;
 constexpr int8_t NONE = -1, UNDECIDED = -2;
-constexpr int MOST = 8;  // surfaces of a cell: MAX_LEVELS of config.py
+constexpr int MAX_LEVELS = 8;  // surfaces of a cell: MAX_LEVELS of config.py
 
 struct Standing {
     int64_t cell = 0;
@@ -26,10 +26,10 @@ struct Standing {
 // A cell with levels.
 struct Several {
     int64_t cell;
-    float height[MOST];     // [m] of the surfaces, 0 the ground; NaN: not there, or of too few points
+    float height[MAX_LEVELS];     // [m] of the surfaces, 0 the ground; NaN: not there, or of too few points
     uint16_t firm = 0;      // surfaces of many points, a bit each
     uint16_t entered = 0;   // levels that a way from the ground may lead to, a bit each
-    bool is_open = false;   // one of them may be reached before the ground
+    bool may_change = false;   // one of them may be reached before the ground
     int8_t first = UNDECIDED;
     int32_t decided_in = 0;  // the step in which it was reached first
 };
@@ -76,63 +76,63 @@ struct Search {
     bool enter(const Standing& standing) {
         undecided = 0, nodes.clear();
         if (standing.surface > 0) {
-            Several& own = several[entry[standing.cell]];
-            own.is_open = true, undecided++, mark(own, standing.surface);
+            Several& here = several[entry[standing.cell]];
+            here.may_change = true, undecided++, mark(here, standing.surface);
         }
-        for (Several& own : several)
+        for (Several& here : several)
             for (int k = 1; k < K; k++)
-                if (touches_ground(own, k)) mark(own, k);
+                if (touches_ground(here, k)) mark(here, k);
         while (!nodes.empty()) {
-            Several& own = several[nodes.back().first];
+            Several& here = several[nodes.back().first];
             const int k = nodes.back().second;
             nodes.pop_back();
             for (const int64_t away : {-pitch, pitch, int64_t(-1), int64_t(1)}) {
-                const int64_t c = own.cell + away;
-                lead_to(own, k, height[c]);
+                const int64_t c = here.cell + away;
+                lead_to(here, k, height[c]);
                 if (entry[c] < 0) continue;
                 Several& other = several[entry[c]];
                 for (int m = 1; m < K; m++)
-                    if (std::fabs(other.height[m] - own.height[k]) <= max_step)
-                        mark(other, m), lead_to(other, m, own.height[k]);
+                    if (std::fabs(other.height[m] - here.height[k]) <= max_step)
+                        mark(other, m), lead_to(other, m, here.height[k]);
             }
         }
         return undecided > 0;
     }
 
-    // Search until the open cells are reached; `is_whole`: until all are.
+    // Search until the cells that may change are reached; `is_whole`: until all are.
     void run(const Standing& standing, bool is_whole) {
-        open.assign(cells, 0), blind.resize(cells);
+        unreached.assign(cells, 0), blind.resize(cells);
         if (next.size() <= size_t(K + 1) * cells) wave.resize((K + 1) * cells + 1), next.resize((K + 1) * cells + 1);
         for (int64_t i = 0; i < H; i++)
-            for (int64_t c = at(i, 0); c < at(i, W); c++) open[c] = height[c] == height[c] ? 1 | KNOWN : GUESS;
-        for (const Several& own : several) {
-            for (int k = 1; k < K; k++) open[own.cell] |= uint16_t(own.height[k] == own.height[k]) << k;
-            if (own.is_open) open[own.cell] |= OPEN;
+            for (int64_t c = at(i, 0); c < at(i, W); c++) unreached[c] = height[c] == height[c] ? 1 | KNOWN : GUESS;
+        for (const Several& here : several) {
+            for (int k = 1; k < K; k++) unreached[here.cell] |= uint16_t(here.height[k] == here.height[k]) << k;
+            if (here.may_change) unreached[here.cell] |= MAY_CHANGE;
         }
         step = 0, number = 0, fresh.clear();
         if (standing.found) reach(standing.surface, standing.cell);
         for (step = 1; step <= H + W && number && (undecided || is_whole); step++) {
             wave.swap(next);
             spread(std::exchange(number, 0));
-            for (const int32_t c : fresh) open[c] &= uint16_t(~FRESH);
+            for (const int32_t c : fresh) unreached[c] &= uint16_t(~FRESH);
             fresh.clear();
         }
     }
 
-    bool is_reached(int64_t c) const { return (open[c] & (1 | KNOWN)) == KNOWN; }
+    bool is_reached(int64_t c) const { return (unreached[c] & (1 | KNOWN)) == KNOWN; }
 
   private:
-    // Bits of `open` besides those of the surfaces that were not reached: the ground is known; its guess was not
+    // Bits of `unreached` besides those of the surfaces that were not reached: the ground is known; its guess was not
     // reached; it came in this step; a level may be first.
-    static constexpr uint16_t KNOWN = 1 << 12, GUESS = 1 << 13, FRESH = 1 << 14, OPEN = 1 << 15;
+    static constexpr uint16_t KNOWN = 1 << 12, GUESS = 1 << 13, FRESH = 1 << 14, MAY_CHANGE = 1 << 15;
     static constexpr int SHIFT = 27;
-    std::vector<uint16_t> open;       // (cells)
+    std::vector<uint16_t> unreached;       // (cells)
     std::vector<int32_t> blind;       // (cells) cells since the last surface
     std::vector<int32_t> wave, next;  // nodes: surface << SHIFT | cell
     std::vector<int32_t> fresh;       // cells whose guess came in this step
     std::vector<std::pair<int32_t, int>> nodes;  // entry and surface
     int64_t number = 0;                          // of nodes in `next`
-    int64_t undecided = 0;                       // open cells that were not reached
+    int64_t undecided = 0;                       // cells that may change and were not reached
     int32_t step = 0;
 
     static int64_t nearest_of(const float* centers, int64_t size, float value) {
@@ -184,52 +184,52 @@ struct Search {
         return k < 0 ? support[i * W + j] >= SETTLED : several[k].firm >> surface & 1;
     }
 
-    bool touches_ground(const Several& own, int k) const {
+    bool touches_ground(const Several& here, int k) const {
         for (const int64_t away : {-pitch, pitch, int64_t(-1), int64_t(1)})
-            if (std::fabs(height[own.cell + away] - own.height[k]) <= max_step) return true;
+            if (std::fabs(height[here.cell + away] - here.height[k]) <= max_step) return true;
         return false;
     }
 
     // Note that a way may lead from a height to a level, and not to the ground of its cell.
-    void lead_to(Several& own, int k, float from) {
-        if (own.is_open || !(std::fabs(from - own.height[k]) <= max_step) || std::fabs(from - own.height[0]) <= max_step)
+    void lead_to(Several& here, int k, float from) {
+        if (here.may_change || !(std::fabs(from - here.height[k]) <= max_step) || std::fabs(from - here.height[0]) <= max_step)
             return;
-        own.is_open = true, undecided++;
+        here.may_change = true, undecided++;
     }
 
-    void mark(Several& own, int k) {
-        if (own.entered >> k & 1) return;
-        own.entered |= uint16_t(1 << k), nodes.emplace_back(int32_t(&own - several.data()), k);
+    void mark(Several& here, int k) {
+        if (here.entered >> k & 1) return;
+        here.entered |= uint16_t(1 << k), nodes.emplace_back(int32_t(&here - several.data()), k);
     }
 
     void reach(int k, int64_t c) {
-        open[c] &= uint16_t(~(k == K ? GUESS : 1 << k)), next[number++] = int32_t(k) << SHIFT | int32_t(c);
-        if (!(open[c] & OPEN)) return;
-        Several& own = several[entry[c]];
+        unreached[c] &= uint16_t(~(k == K ? GUESS : 1 << k)), next[number++] = int32_t(k) << SHIFT | int32_t(c);
+        if (!(unreached[c] & MAY_CHANGE)) return;
+        Several& here = several[entry[c]];
         const int8_t surface = k == K ? NONE : int8_t(k);
-        if (own.first == UNDECIDED) own.first = surface, own.decided_in = step, undecided--;
-        else if (own.decided_in == step && surface != NONE && (own.first == NONE || surface < own.first)) own.first = surface;
+        if (here.first == UNDECIDED) here.first = surface, here.decided_in = step, undecided--;
+        else if (here.decided_in == step && surface != NONE && (here.first == NONE || surface < here.first)) here.first = surface;
     }
 
     // Reach the cells beside those of the first `size` nodes of the wave.
     void spread(int64_t size) {
         const float* const ground = height.data();
         const int32_t* const nodes_of_wave = wave.data();
-        uint16_t* const left = open.data();
+        uint16_t* const left = unreached.data();
         int32_t* const to = next.data();
-        const int64_t aside[] = {-pitch, pitch, -1, 1};
+        const int64_t neighbours[] = {-pitch, pitch, -1, 1};
         int64_t count = 0;
         for (int64_t n = 0; n < size; n++) {
             const int k = nodes_of_wave[n] >> SHIFT;
             const int64_t c = nodes_of_wave[n] & ((1 << SHIFT) - 1);
             const float from = k == 0 || k == K ? height[c] : several[entry[c]].height[k];
-            const int32_t gone = k < K ? 0 : blind[c];
-            const float limit = max_step + rise * float(gone);
-            for (const int64_t away : aside) {
+            const int32_t num_blind = k < K ? 0 : blind[c];
+            const float limit = max_step + rise * float(num_blind);
+            for (const int64_t away : neighbours) {
                 const int64_t beside = c + away;
                 const uint16_t bits = left[beside];
                 if (bits & ~(1 | KNOWN)) {
-                    number = count, visit(beside, from, gone, limit), count = number;
+                    number = count, visit(beside, from, num_blind, limit), count = number;
                 } else {  // mostly: the ground alone, or nothing, without a branch
                     const bool reaches = (bits & 1) & (std::fabs(ground[beside] - from) <= limit);
                     to[count] = int32_t(beside), count += reaches, left[beside] = uint16_t(bits ^ reaches);
@@ -239,16 +239,16 @@ struct Search {
         number = count;
     }
 
-    void visit(int64_t c, float from, int32_t gone, float limit) {
-        if ((open[c] & 1) && std::fabs(height[c] - from) <= limit) reach(0, c);
-        for (int k = 1; k < K && !gone && entry[c] >= 0; k++)  // what is guessed leads to the ground alone
-            if ((open[c] >> k & 1) && std::fabs(several[entry[c]].height[k] - from) <= limit) reach(k, c);
-        if (gone >= max_blind) return;
-        if (open[c] & GUESS) {
-            height[c] = from, blind[c] = gone + 1;
-            reach(K, c), open[c] |= FRESH, fresh.push_back(int32_t(c));
-        } else if (open[c] & FRESH) {
-            blind[c] = from < height[c] ? gone + 1 : from == height[c] ? std::min(blind[c], gone + 1) : blind[c];
+    void visit(int64_t c, float from, int32_t num_blind, float limit) {
+        if ((unreached[c] & 1) && std::fabs(height[c] - from) <= limit) reach(0, c);
+        for (int k = 1; k < K && !num_blind && entry[c] >= 0; k++)  // what is guessed leads to the ground alone
+            if ((unreached[c] >> k & 1) && std::fabs(several[entry[c]].height[k] - from) <= limit) reach(k, c);
+        if (num_blind >= max_blind) return;
+        if (unreached[c] & GUESS) {
+            height[c] = from, blind[c] = num_blind + 1;
+            reach(K, c), unreached[c] |= FRESH, fresh.push_back(int32_t(c));
+        } else if (unreached[c] & FRESH) {
+            blind[c] = from < height[c] ? num_blind + 1 : from == height[c] ? std::min(blind[c], num_blind + 1) : blind[c];
             height[c] = std::min(height[c], from);
         }
     }

@@ -53,14 +53,14 @@ struct MapUpdate : levels::Choice {
     }
 
     static void grow_older(const float* support, float* __restrict time, float* __restrict variance, int64_t number,
-                           float dt, float added, float most) {
+                           float dt, float added, float max_variance) {
         for (int64_t first = 0; first < number; first += BLOCK) {
             const int64_t end = std::min(first + BLOCK, number);
             int32_t any = 0;
             for (int64_t p = first; p < end; p++) any |= support[p] > 0;
             for (int64_t p = first; any && p < end; p++) {  // mostly none
                 const bool is_there = support[p] > 0;
-                const float older = std::min(variance[p] + added, most);
+                const float older = std::min(variance[p] + added, max_variance);
                 time[p] = time[p] + (is_there ? dt : 0.0f), variance[p] = is_there ? older : variance[p];
             }
         }

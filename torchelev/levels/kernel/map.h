@@ -87,7 +87,7 @@ struct Map {
         return sights.are_free_below(own.x[c / u.W], own.y[c % u.W], top);
     }
 
-    // The ground as a surface: `_as_found`.
+    // The ground as a surface: `as_found`.
     Found ground_of(int64_t c) const {
         const int64_t n = b * cells + c;
         const float g = u.elevation[n], variance = std::max(u.ground_variance[n] - g2, u.variance_floor);

@@ -1,4 +1,4 @@
-// Sorting the points of a scan into the ground and other surfaces: `_sort_points`.
+// Sorting the points of a scan into the ground and other surfaces: `sort_points`.
 #pragma once
 
 #include "levels/kernel/scan.h"
@@ -104,7 +104,7 @@ struct Sorting : Scan {
         return shows && !solid;
     }
 
-    // Sort the points of a cell, by their places in `sorted`: `_sort_points`.
+    // Sort the points of a cell, by their places in `sorted`: `sort_points`.
     void sort_cell(int64_t c, int64_t begin, int64_t end, Waiting& waiting, int64_t* numbers) {
         static thread_local std::vector<Cluster> clusters;
         find_clusters(begin, end, clusters);
@@ -136,7 +136,8 @@ struct Sorting : Scan {
                 if (stands) found_ground(c, nearest), known = true, g = u.elevation[b * cells + c];
             } else {
                 const bool above = known && found.lower > g;
-                bool shown = known && !above ? ground_floats : (above && is_open(p)) || floats(c, found.lower);
+                const bool is_free = is_open(p) || free_top(p) >= g + u.min_gap;
+                bool shown = known && !above ? ground_floats : (above && is_free) || floats(c, found.lower);
                 shown |= (!known && clusters[rank].above) || (u.by_gap && (known || rank > 0));
                 if (!shown) {
                     if (!known && !(waiting.number > 0)) waiting = {found.mean, found.number};
