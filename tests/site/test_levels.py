@@ -246,6 +246,12 @@ def test_another_site_is_refused(tmp_path, settings, message):
     SiteMap(resolution=0.1, path=path).close()  # nothing holds its lock
 
 
+def test_settings_that_a_site_does_not_use_may_differ(tmp_path):
+    path = tmp_path / "site"
+    SiteMap(resolution=0.1, path=path, levels=LEVELS).close()
+    SiteMap(resolution=0.1, path=path, levels=LevelsConfig(max_levels=3, min_support=5.0, max_step=0.2)).close()
+
+
 def test_levels_are_not_added_later(tmp_path):
     SiteMap(resolution=0.1, path=tmp_path / "site").close()
     message = "levels.max_levels: must be None: the site was begun without, as from the first merge on, got 3"
