@@ -58,13 +58,20 @@ def _as_measured(known: Known, robot: Tensor, variance: Tensor, age: Tensor) -> 
     return variance, (known.now[robot] - age).float()
 
 
-def read_robots(
-    emap: ElevationMap, state: MapState, windows: Windows, alignment: Alignment, resolution: float, min_gap: float
-) -> Robots:
-    """Return what a map knows; arguments as of `read_windows`, and the least gap [m] between surfaces."""
-    stack = read_stack(emap, state, windows.known)
-    change = compare(stack, windows.contribution, state.elapsed, min_gap)
-    return Robots(windows_of(windows, change, resolution), change, alignment, resolution)
+def read_surfaces(
+    emap: ElevationMap, state: MapState, windows: Windows, resolution: float, min_gap: float
+) -> tuple[Windows, Change]:
+    """Return the windows of a map, whose ground is the lowest surface, and all surfaces of them.
+
+    Args:
+        emap: the map.
+        state: its state, as of `read_windows`.
+        windows: as these were read.
+        resolution: [m].
+        min_gap: [m] between surfaces.
+    """
+    change = compare(read_stack(emap, state, windows.known), windows.contribution, state.elapsed, min_gap)
+    return windows_of(windows, change, resolution), change
 
 
 def fuse_levels(
