@@ -89,7 +89,7 @@ def test_what_a_robot_measures_again_replaces_its_share(maps):
         assert read(site, "level1.variance") == pytest.approx(own, rel=0.01)
         assert read(site, "level1.underside") == pytest.approx(underside, abs=1e-3)
         walk(road, BRIDGE, [place])
-    assert own < 0.5 * first, "it was measured again"
+    assert own < 0.6 * first, "it was measured again"
 
 
 def test_two_robots_are_twice_as_sure(walked):
