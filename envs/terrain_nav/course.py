@@ -12,6 +12,8 @@ from torchelev import ElevationMap, ElevationMapConfig, GridConfig
 from torchelev.pipeline import rate
 from torchelev.sim import Course, CourseConfig, HeightField, Structures, make_course
 
+_STRIDE = 2  # samples of the ground from one of the ceilings to the next
+
 
 @dataclass(frozen=True, eq=False)
 class Ceilings:
@@ -46,17 +48,17 @@ def make_rated_course(cfg: CourseConfig, device: torch.device | str = "cpu") -> 
     return RatedCourse(*parts, structures=course.structures, ceilings=ceilings)
 
 
-def _find_ceilings(structures: Structures, field: HeightField, stride: int = 2) -> Ceilings:
-    """Return the undersides over every second sample of the ground."""
+def _find_ceilings(structures: Structures, field: HeightField) -> Ceilings:
+    """Return the undersides over some samples of the ground."""
     count, resolution = field.heights.shape[1], field.resolution
-    axis = (torch.arange(0, count, stride, device=field.device) - (count - 1) / 2) * resolution
+    axis = (torch.arange(0, count, _STRIDE, device=field.device) - (count - 1) / 2) * resolution
     xy = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), -1).view(1, -1, 2)
-    ground = field.heights[:, ::stride, ::stride].flatten(1)
+    ground = field.heights[:, ::_STRIDE, ::_STRIDE].flatten(1)
     tiles = [
         structures.underside(torch.full((1,), k, device=field.device), xy, ground[k : k + 1])
         for k in range(field.num_tiles)
     ]
-    return Ceilings(torch.cat(tiles).view(-1, len(axis), len(axis)), stride * resolution)
+    return Ceilings(torch.cat(tiles).view(-1, len(axis), len(axis)), _STRIDE * resolution)
 
 
 def _rate(field: HeightField) -> Tensor:

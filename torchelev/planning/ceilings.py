@@ -39,8 +39,14 @@ def too_low(emap: ElevationMap, height: float | None, state: MapState | None = N
 def needed_height(emap: ElevationMap, height: float | None) -> float:
     """Return how high what hangs above the ground must be [m]: as high as the robot, and at least `min_gap`.
 
-    A smaller space is solid to the map, which may or may not have seen it. 0 of a map without levels; arguments as
-    above.
+    A smaller space is solid to the map, which may or may not have seen it. 0 of a map without levels.
+
+    Args:
+        emap: the maps.
+        height: of the robot [m]; None: `min_gap` of the levels.
+
+    Raises:
+        ValueError: if a height is given for a map without levels.
     """
     if emap.levels is None:
         hint = "give the map levels=LevelsConfig(), or leave it out"

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.layers import surrounding_cells, weighted_mean
+from torchelev.levels import LAYERS as LEVEL_LAYERS
 from torchelev.site.tiles import LAYERS as STORED
 from torchelev.site.tiles import TILE, Tiles, locate
 
@@ -131,9 +132,16 @@ def sample_tiles(
     finite = (cells.abs() < _FARTHEST).all(1)  # NaN is not
     i, j, weight = surrounding_cells(torch.where(finite[:, None], cells, 0.0)[None], mode)
     sources = sources_of([name], tiles)
-    found = tiles.look_up(locate(i.flatten().long(), j.flatten().long()), sources)
-    stored = dict(zip(sources, found, strict=True))
+    looked_up = tiles.look_up(locate(i.flatten().long(), j.flatten().long()), sources)
+    stored = dict(zip(sources, looked_up, strict=True))
     values = compute_layer(name, stored, clock, tiles).view(weight.shape)
     weight = torch.where(values.isnan() | ~finite, 0.0, weight)
-    mean, valid = weighted_mean(torch.where(weight > 0, values, 0.0), weight)  # 0 times inf, or NaN, is NaN
-    return mean[0].float(), valid[0]
+    sample = _lowest if name in LEVEL_LAYERS else weighted_mean
+    found, valid = sample(torch.where(weight > 0, values, 0.0), weight)  # 0 times inf, or NaN, is NaN
+    return found[0].float(), valid[0]
+
+
+def _lowest(values: Float[Tensor, "B K M"], weight: Float[Tensor, "B K M"]) -> tuple[Tensor, Tensor]:
+    """Return the lowest of K values, which may be infinite, and where `weighted_mean` is valid."""
+    valid = weight.sum(1) >= 0.5
+    return torch.where(valid, torch.where(weight > 0, values, torch.inf).amin(1), 0.0), valid

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from torchelev.site.reading import Clock
 
 SPACE = ("space/free_top", "space/is_open")
-SHARED = ("max_levels", "min_gap", "min_support")  # settings that a site uses
+SHARED = ("max_levels", "min_gap")  # settings that a site uses
 _BY_LEVEL = ("elevation", "underside", "variance", "time")
 _GROUND = ("elevation", "variance", "time", "upper_bound")
 
@@ -31,7 +31,7 @@ class SiteLevels:
     """The levels of a site: L = K - 1 surfaces of a cell besides its ground, which is the lowest one.
 
     Args:
-        cfg: K, `min_gap` and `min_support`; the other settings are of no use to a site. None, or K = 1: no levels.
+        cfg: K and `min_gap`; the other settings are of no use to a site. None, or K = 1: no levels.
 
     Raises:
         TypeError: `cfg` is no LevelsConfig.

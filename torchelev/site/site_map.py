@@ -19,9 +19,10 @@ from torchelev.ops.storage import keep_freed_memory
 from torchelev.site.channels import SiteChannels
 from torchelev.site.fill_levels import fill_levels
 from torchelev.site.fusion.align import align
-from torchelev.site.fusion.fuse_levels import Robots, read_robots
+from torchelev.site.fusion.fuse_levels import read_surfaces
 from torchelev.site.fusion.merge import MergeReport, merge_windows
 from torchelev.site.fusion.shares import Change, read_changes
+from torchelev.site.fusion.stacks import Change as SurfaceChange
 from torchelev.site.fusion.windows import (
     Alignment,
     Contribution,
@@ -188,14 +189,15 @@ class SiteMap(OpenedSite):
         number = self._num_commits + 1
         changes = read_changes(emap, windows, alignment, self._tiles.channels, self.resolution, number)
         shares = {name: change.now for name, change in changes.items()}
-        robots = self._read_robots(emap, state, windows, alignment)
-        if robots is not None:
-            windows = all_windows = robots.windows
-        stack = None if robots is None else robots.change.now
+        surfaces, levels = None, self._tiles.levels.cfg
+        if levels is not None:  # without a group
+            windows, surfaces = read_surfaces(emap, state, windows, self.resolution, levels.min_gap)
+            all_windows = windows
+        stack = None if surfaces is None else surfaces.now
         contribution = snapshot(emap, windows, alignment, state.elapsed, keyframes, shares, stack)
         if self._store is None and new is None:  # interrupted, memory may hold a part, which must not count twice
             _contributions.setdefault(emap, {})[self._id] = contribution
-        contradictions = self._fuse(all_windows, all_aligned, now, new, changes, robots)[own]
+        contradictions = self._fuse(all_windows, all_aligned, now, new, changes, surfaces)[own]
         _contributions.setdefault(emap, {})[self._id] = contribution
         self._raise_interrupted()
         return MergeReport(*alignment, count(windows.is_new), contradictions)
@@ -207,15 +209,6 @@ class SiteMap(OpenedSite):
             return None
         device = contribution.elapsed.device
         return drop_reset(contribution, emap.num_resets.to(device), emap.state.elapsed.to(device))
-
-    def _read_robots(
-        self, emap: ElevationMap, state: MapState, windows: Windows, alignment: Alignment
-    ) -> Robots | None:
-        """Return all surfaces that a map knows; None if the site has no levels."""
-        levels = self._tiles.levels.cfg
-        if levels is None:
-            return None
-        return read_robots(emap, state, windows, alignment, self.resolution, levels.min_gap)
 
     def _bring(self, emap: ElevationMap) -> MapState:
         """Return a map's state on the site's device, without predictions: a site keeps what was measured."""
@@ -289,12 +282,12 @@ class SiteMap(OpenedSite):
         now: float,
         new: Recorded | None,
         changes: dict[str, Change],
-        robots: Robots | None,
+        surfaces: SurfaceChange | None,
     ) -> Int[Tensor, "B"]:
         """Fuse windows, or their keyframes, into tiles; return each robot's contradictions."""
         rate, time = self._clock.rate, max(self._time, now)
         if self._keyframes is None or new is None:
-            parts = merge_windows(self._tiles, windows, alignment, self.resolution, rate, self.cfg, changes, robots)
+            parts = merge_windows(self._tiles, windows, alignment, self.resolution, rate, self.cfg, changes, surfaces)
             return self._write(parts, time, len(windows.known.corner))
         parts = merge_recorded(self._tiles, self._keyframes.rows, new, self.resolution, rate, self.cfg)
         contradictions = self._write(parts if self._store else list(parts), time, len(new.ids), arrays_of(new), 1)

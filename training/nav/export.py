@@ -48,7 +48,8 @@ def record(policy: Any, cfg: TerrainNavConfig, folder: Path) -> bool:
     """Write an episode with the map in the loop beside policy.onnx.
 
     Returns:
-        False, with nothing written, if the policy reads images that are filled or show ceilings: no `MapImage` does.
+        False, with nothing written, if the policy reads images that are filled or show ceilings, as no `MapImage` does,
+        or if structures stand on the course, whose map has levels.
     """
     task = TerrainNav(cfg, 1, "cpu", "map", seed=12)
     sight = task.sight

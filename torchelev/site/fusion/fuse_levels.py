@@ -58,13 +58,20 @@ def _as_measured(known: Known, robot: Tensor, variance: Tensor, age: Tensor) -> 
     return variance, (known.now[robot] - age).float()
 
 
-def read_robots(
-    emap: ElevationMap, state: MapState, windows: Windows, alignment: Alignment, resolution: float, min_gap: float
-) -> Robots:
-    """Return what a map knows; arguments as of `read_windows`, and the least gap [m] between surfaces."""
-    stack = read_stack(emap, state, windows.known)
-    change = compare(stack, windows.contribution, state.elapsed, min_gap)
-    return Robots(windows_of(windows, change, resolution), change, alignment, resolution)
+def read_surfaces(
+    emap: ElevationMap, state: MapState, windows: Windows, resolution: float, min_gap: float
+) -> tuple[Windows, Change]:
+    """Return the windows of a map, whose ground is the lowest surface, and all surfaces of them.
+
+    Args:
+        emap: the map.
+        state: its state, as of `read_windows`.
+        windows: as these were read.
+        resolution: [m].
+        min_gap: [m] between surfaces.
+    """
+    change = compare(read_stack(emap, state, windows.known), windows.contribution, state.elapsed, min_gap)
+    return windows_of(windows, change, resolution), change
 
 
 def fuse_levels(
@@ -97,6 +104,7 @@ def fuse_levels(
     levels = tiles.levels.cfg
     assert levels is not None
     cells = read_cells(layers, tiles)
+    before = cells.ground
     found = sort_entries(cells, entries, robots.change.now.is_open.flatten()[place], levels.min_gap)
     cells = raise_ground(cells, layers, found.is_raised, levels.min_gap, rate, cfg)
     own, aside = ((found.is_aside == other).nonzero()[:, 0] for other in (False, True))
@@ -105,7 +113,8 @@ def fuse_levels(
     cells = cells._replace(ground=layers[_GROUND[0]].clone())
     others = robot[aside], entries.cell[aside], place[aside]
     cells = fuse_surfaces(cells, robots, pieces, others, levels, rate, cfg)
-    write_cells(cells, layers, robots, pieces, found.is_open, tiles)
+    write_surfaces(cells, layers, tiles)
+    write_space(layers, before, found.is_open, tiles, robots, pieces)
     return robot[own][is_contradicted]
 
 
@@ -219,19 +228,47 @@ def _read_gone(robots: Robots, pieces: Pieces, level: int) -> Surfaces:
     return Surfaces(cell, lower.elevation, upper.elevation, upper.variance, support, upper.time, lower, upper)
 
 
-def write_cells(
-    cells: Cells, layers: Float[Tensor, "L C"], robots: Robots, pieces: Pieces, is_open: Bool[Tensor, "C"], tiles: Tiles
-) -> None:
-    """Write surfaces into the layers of tiles, and what robots know of the space above the ground."""
+def write_surfaces(cells: Cells, layers: Float[Tensor, "L C"], tiles: Tiles) -> None:
+    """Write surfaces into the layers of tiles."""
     is_there = cells.surfaces.support[0] > 0
     for name in SURFACE:
         layers[_rows(tiles, name)] = torch.where(is_there, getattr(cells.surfaces, name)[0], torch.nan)
-    stack = robots.change.now
+
+
+def write_space(
+    layers: Float[Tensor, "L C"],
+    before: Float[Tensor, "C"],
+    is_open: Bool[Tensor, "C"],
+    tiles: Tiles,
+    robots: Robots,
+    pieces: Pieces,
+) -> None:
+    """Write what the site and robots know of the space above the ground, in place.
+
+    Free space counts from the ground that it was seen above: where the site's ground has become another one, the site
+    forgets it, and robots whose ground is another one add nothing.
+
+    Args:
+        layers: of the tiles, with the ground after the merge.
+        before: the ground before the merge [m], NaN where unknown.
+        is_open: cells in which the space above the ground is known to be free for at least the least gap.
+        tiles: of the site.
+        robots: what they know.
+        pieces: of the windows.
+    """
+    (row, opened), gap = (tiles.layers.index(name) for name in SPACE), tiles.levels.max_difference
+    ground, stack = layers[_GROUND[0]], robots.change.now
     robot, cell, place = pieces.select(stack.free_top > -torch.inf)
-    top = stack.free_top.flatten()[place] - rise(
-        robots.windows.known, robots.alignment, robot, place, robots.resolution
-    )
-    row, opened = (tiles.layers.index(name) for name in SPACE)
-    highest = layers[row].nan_to_num(nan=-torch.inf).scatter_reduce(0, cell, top, "amax")
+    above = rise(robots.windows.known, robots.alignment, robot, place, robots.resolution)
+    own = torch.where(stack.is_known[:, 0], stack.upper[:, 0], torch.nan).flatten()[place] - above
+    top = stack.free_top.flatten()[place] - above
+    top = torch.where(_is_same_ground(own, ground[cell], gap), top, -torch.inf)
+    kept = torch.where(_is_same_ground(before, ground, gap), layers[row].nan_to_num(nan=-torch.inf), -torch.inf)
+    highest = kept.scatter_reduce(0, cell, top, "amax")
     layers[row] = torch.where(highest > -torch.inf, highest, torch.nan)
-    layers[opened] = torch.where(is_open & ~layers[_GROUND[0]].isnan(), 1.0, torch.nan)
+    layers[opened] = torch.where(is_open & ~ground.isnan(), 1.0, torch.nan)
+
+
+def _is_same_ground(one: Tensor, other: Tensor, min_gap: float) -> Bool[Tensor, "..."]:
+    """Return where heights [m] are within `min_gap`, or both unknown: NaN."""
+    return ((one - other).abs() <= min_gap) | (one.isnan() & other.isnan())

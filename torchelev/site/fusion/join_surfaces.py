@@ -64,6 +64,12 @@ class Cells(NamedTuple):
         away = torch.where(s.support > 0, distance(lower, upper, s.lower, s.upper), torch.inf)
         return away[0].min(0)
 
+    def mask_of(self, place: Int[Tensor, "C"], counts: Bool[Tensor, "C"]) -> Bool[Tensor, "1 L C"]:
+        """Return the mask of one place in each of the cells that count."""
+        return torch.zeros_like(self.surfaces.support, dtype=torch.bool).scatter(
+            1, place[None, None], counts[None, None]
+        )
+
 
 def join(cells: Cells, new: Surfaces, min_gap: float, rate: float, cfg: SiteConfig) -> None:
     """Join surfaces with cells, in place.
@@ -74,11 +80,10 @@ def join(cells: Cells, new: Surfaces, min_gap: float, rate: float, cfg: SiteConf
     for part in _rounds(new):
         here = cells.at(part.cell)
         away, place = here.nearest(part.lower, part.upper)
-        to_ground = (part.lower - here.ground).clamp(min=0).maximum(here.ground - part.upper).nan_to_num(nan=torch.inf)
+        to_ground = distance(part.lower, part.upper, here.ground, here.ground).nan_to_num(nan=torch.inf)
         joins = (away <= min_gap) & (away <= to_ground)
         fused = _fuse(here.surfaces, place, part, rate, cfg)
-        chosen = torch.zeros_like(here.surfaces.support, dtype=torch.bool)
-        chosen[0].scatter_(0, place[None], joins[None])
+        chosen = here.mask_of(place, joins)
         surfaces = here.surfaces._replace(
             **{n: torch.where(chosen, fused[n], getattr(here.surfaces, n)) for n in SURFACE}
         )
@@ -146,9 +151,7 @@ def withdraw(cells: Cells, gone: Surfaces, min_gap: float) -> None:
         away, place = here.nearest(part.lower, part.upper)
         time = here.surfaces.time[0].gather(0, place[None])[0]
         goes = (away <= min_gap) & (time <= part.time + _SAME_TIME)
-        mask = torch.zeros_like(here.surfaces.support, dtype=torch.bool)
-        mask[0].scatter_(0, place[None], goes[None])
-        cells.put(part.cell, _without(here.surfaces, mask))
+        cells.put(part.cell, _without(here.surfaces, here.mask_of(place, goes)))
 
 
 def tidy(cells: Cells, min_gap: float) -> Cells:

@@ -15,6 +15,7 @@ from torchelev.site.fusion.fuse_levels import Robots, fuse_levels
 from torchelev.site.fusion.fuse_shares import fuse_channels
 from torchelev.site.fusion.pieces import Group, Pieces, group_tiles
 from torchelev.site.fusion.shares import Change
+from torchelev.site.fusion.stacks import Change as SurfaceChange
 from torchelev.site.fusion.windows import Alignment, Windows
 from torchelev.site.site_config import SiteConfig
 from torchelev.site.tiles import LAYERS, Tile, Tiles
@@ -51,7 +52,7 @@ def merge_windows(
     rate: float,
     cfg: SiteConfig,
     changes: Mapping[str, Change] = MappingProxyType({}),
-    robots: Robots | None = None,
+    surfaces: SurfaceChange | None = None,
 ) -> Iterator[Merged]:
     """Return the tiles that the windows touch after fusion, a group at a time; changes none in memory.
 
@@ -63,11 +64,12 @@ def merge_windows(
         rate: [m^2/s] at which variances grow.
         cfg: settings.
         changes: of the channels that the robots know.
-        robots: all surfaces of the same robots, whose `windows` these are; None: of a site without levels.
+        surfaces: all that the robots know, of a site with levels: the ground of `windows` is the lowest one.
     """
     touched = windows.is_new | windows.is_bounded
-    if robots is not None:
-        touched = touched | robots.change.is_touched
+    robots = None if surfaces is None else Robots(windows, surfaces, alignment, resolution)
+    if surfaces is not None:
+        touched = touched | surfaces.is_touched
     for change in changes.values():
         touched = touched | change.is_new
     groups = group_tiles(windows.known.corner, touched)

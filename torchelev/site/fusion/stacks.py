@@ -34,7 +34,8 @@ class Stack(NamedTuple):
     age: Float[Tensor, "B K H W"]  #: [s] since the last measurement
     is_known: Bool[Tensor, "B K H W"]  #: the surface is there
     is_open: Bool[Tensor, "B H W"]  #: the space above the ground is known to be free for at least the least gap
-    free_top: Float[Tensor, "B H W"]  #: [m] of the highest ray over the cell; -inf: none passed
+    #: [m] up to which the space above the ground is free; -inf: none is known, or place 0 is not the robot's ground
+    free_top: Float[Tensor, "B H W"]
 
 
 _OF_SURFACES = ("lower", "upper", "variance", "support", "age", "is_known")
@@ -70,7 +71,8 @@ def _from_below(stack: Stack) -> Stack:
         order = torch.cat([place, order.scatter(1, place, 0)[:, 1:]], 1)
         stack = stack._replace(**{name: getattr(stack, name).gather(1, order) for name in _OF_SURFACES})
     has_others = has_ground[:, 0] & stack.is_known[:, 1:].any(1)
-    return stack._replace(is_open=has_others | (stack.is_open & is_same))
+    free_top = torch.where(is_same, stack.free_top, -torch.inf)
+    return stack._replace(is_open=has_others | (stack.is_open & is_same), free_top=free_top)
 
 
 def move_stack(stack: Stack, corner: Int[Tensor, "B 2"]) -> Stack:
@@ -140,7 +142,7 @@ def compare(stack: Stack, contribution: Contribution | None, elapsed: Int[Tensor
 def windows_of(windows: Windows, change: Change, resolution: float) -> Windows:
     """Return windows whose ground is that of the surfaces, the lowest ones; their cells are `resolution` [m] wide."""
     ground, known = change.now, windows.known
-    is_same = windows.known.elevation == ground.upper[:, 0]
+    is_same = known.elevation.to(ground.upper) == ground.upper[:, 0]
     contribution = windows.contribution
     if contribution is not None and change.before is not None:
         moved = (change.before.corner - contribution.known.corner) * resolution
