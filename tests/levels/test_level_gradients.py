@@ -168,3 +168,5 @@ def test_levels_of_other_maps_are_refused():
             emap.layer("ceiling", levels=wrong)
         with pytest.raises(ValueError, match="levels: expected"):
             emap.load_state(emap.state, wrong)
+    with pytest.raises(TypeError, match=r"levels: must be Levels, got MapLevels; give emap.levels.in_windows"):
+        emap.layer("ceiling", levels=emap.levels)

@@ -141,6 +141,7 @@ def test_config_survives_a_file(tmp_path):
         ({"max_levels": 100}, r"levels\.max_levels: must be a whole number from 1 to 8"),
         ({"max_levels": 2.0}, "whole number"),
         ({"min_gap": 0.0}, r"levels\.min_gap"),
+        ({"min_gap": 400.0}, r"levels\.min_gap: must be at most 20 m, got 400.0; give metres"),
         ({"max_step": -1.0}, r"levels\.max_step"),
         ({"separation": "hope"}, r"levels\.separation: must be one of rays, gap"),
         ({"max_blind": float("nan")}, r"levels\.max_blind"),

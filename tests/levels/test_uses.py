@@ -136,7 +136,7 @@ def test_bad_crops_are_refused(settings, words):
 
 def test_voxels_need_levels_and_a_window(under):
     plain = ElevationMap(ElevationMapConfig(grid=GRID))
-    with pytest.raises(ValueError, match="must have levels"):
+    with pytest.raises(ValueError, match="must be maps with levels"):
         VoxelCrop()(plain, under[1])
     with pytest.raises(ValueError, match="must lie in the map"):
         VoxelCrop(length_x=9.0)(*under)

@@ -44,15 +44,19 @@ def require_same(maps, atol=2e-5):
     assert (emap.layer("ceiling") > ground).any() and np.isinf(found.layer("ceiling")).any()
 
 
+def require_same_levels(maps):
+    levels = {n: v for n, v in map_arrays(maps[0]).items() if n.startswith("levels_")}
+    for key, wanted in levels.items():
+        assert maps[1].tensor(key, wanted.dtype).tobytes() == wanted.tobytes(), key
+
+
 @pytest.mark.parametrize("name", CONFIGS)
 def test_layers_are_those_of_python(library, name):
     maps = pair(library, **CONFIGS[name])
     for k, place in enumerate([*ROAD, (0.0, 0.0, DECK), (0.4, 0.0, DECK)]):
         update(maps, place, seed=k)
         require_same(maps)
-    levels = {n: v for n, v in map_arrays(maps[0]).items() if n.startswith("levels_")}
-    for key, wanted in levels.items():
-        assert maps[1].tensor(key, wanted.dtype).tobytes() == wanted.tobytes(), key
+    require_same_levels(maps)
 
 
 def test_changes_besides_updates(library):
@@ -74,6 +78,21 @@ def test_changes_besides_updates(library):
     assert np.isfinite(maps[1].layer("ceiling")).sum() > 100
     maps[1].reset()
     assert np.isnan(maps[1].layer("ceiling")).all()
+
+
+def test_a_window_that_comes_back_has_lost_what_left(library):
+    emap, found = maps = pair(library)
+    for k, place in enumerate(ROAD):
+        update(maps, place, seed=k)
+    before = np.isfinite(found.layer("ceiling")).sum()
+    nothing = torch.full((1, 1, 3), torch.nan)
+    for x, y in [(1.0, -3.0), (0.0, 1.0)]:
+        pose = te.frames.transform(torch.tensor([x, y, 0.45]), torch.tensor([1.0, 0.0, 0.0, 0.0])).double()
+        emap.update(nothing, pose[None], pose[None], dt=0.0)
+        found.move(pose.numpy())
+    assert 0 < np.isfinite(found.layer("ceiling")).sum() < before
+    require_same_levels(maps)
+    np.testing.assert_array_equal(found.layer("ceiling"), emap.layer("ceiling")[0].numpy())
 
 
 def test_a_saved_map_goes_on(library, tmp_path):

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from torchelev.grid import GridConfig
 
 MAX_LEVELS = 8  # a cell of more is a bush
+MAX_HEIGHT = 20.0  # [m] of a gap or a step; more is a number in other units
 SEPARATIONS = ("rays", "gap")
 
 
@@ -37,7 +38,11 @@ class LevelsConfig:
         is_count = isinstance(K, int) and not isinstance(K, bool) and 1 <= K <= MAX_LEVELS
         hint = "3 hold ground, table and ceiling; each more costs time and 20 bytes a cell"
         require(is_count, "levels.max_levels", rule, repr(K), hint)
-        require_positive(**{"levels.min_gap": self.min_gap, "levels.max_step": self.max_step})
+        sizes = {"levels.min_gap": self.min_gap, "levels.max_step": self.max_step}
+        require_positive(**sizes)
+        rule = f"must be at most {MAX_HEIGHT:g} m"
+        for name, value in sizes.items():
+            require(value <= MAX_HEIGHT, name, rule, value, "give metres")
         known, rule = self.separation in SEPARATIONS, f"must be one of {', '.join(SEPARATIONS)}"
         require(known, "levels.separation", rule, repr(self.separation), "use rays")
         for name in ("max_blind", "min_support"):

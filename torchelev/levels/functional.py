@@ -53,6 +53,7 @@ def require_levels(levels: Levels, state: MapState, cfg: ElevationMapConfig) -> 
     require(
         others > 0, "levels", "must be left out for a map without levels", "levels", "give the config LevelsConfig()"
     )
+    require(isinstance(levels, Levels), "levels", "must be Levels", type(levels).__name__, hint, TypeError)
     B, H, W = state.elevation.shape
     shape, dtype = (B, others, H, W), state.elevation.dtype
     actual = tuple(levels.lower.shape), levels.lower.dtype

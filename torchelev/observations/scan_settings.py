@@ -83,7 +83,7 @@ class ScanSettings:
         for name in ("nominal_height", "scale"):
             self._require_number(name, (int, float), "must be a finite number", -math.inf)
         known = self.surface in SURFACES
-        require(known, "surface", f"must be one of {', '.join(SURFACES)}", repr(self.surface), "use ground")
+        require(known, "surface", f"must be one of {', '.join(SURFACES)}", repr(self.surface), "check its spelling")
         for name in ("noise", "reach", "no_ceiling"):
             self._require_number(name, (int, float), "must be a finite number of at least 0", 0)
         for name in ("num_feet", "inpaint_rings"):

@@ -62,7 +62,7 @@ class VoxelCrop:
     def __post_init__(self) -> None:
         X, Y, Z = (whole_cells(f"length_{axis}", getattr(self, f"length_{axis}"), self.resolution) for axis in "xyz")
         known, rule = self.values in VALUES, f"must be one of {', '.join(VALUES)}"
-        require(known, "values", rule, repr(self.values), "use states")
+        require(known, "values", rule, repr(self.values), "check its spelling")
         require_positive(max_distance=self.max_distance)
         known = self.alignment in ("yaw", "world")
         require(known, "alignment", "must be yaw or world", repr(self.alignment), "use yaw")
@@ -95,7 +95,7 @@ class VoxelCrop:
                 levels.
         """
         hint = "give the map's config levels=LevelsConfig()"
-        require(emap.levels is not None, "emap", "must have levels", "cfg.levels without other surfaces", hint)
+        require(emap.levels is not None, "emap", "must be maps with levels", f"cfg.levels = {emap.cfg.levels}", hint)
         assert emap.levels is not None
         self._pattern.require_inside(emap.cfg.grid)
         T_map_base = check_base(emap, T_map_base)

@@ -17,6 +17,8 @@ struct Waiting {
     float height, number;  // [m], of points; 0: nothing
 };
 
+struct Cluster;  // of sorting.h
+
 // Memory of a thread, kept between updates.
 struct Scratch {
     Points points;
@@ -27,9 +29,11 @@ struct Scratch {
     std::vector<uint8_t> all_above, changed;   // (H W)
     std::vector<uint8_t> had_levels;           // (H W) of the ring, before the scan
     std::vector<uint8_t> simple;               // of `touched`
-    std::vector<int32_t> touched, complex, first, sorted;
+    std::vector<int32_t> touched, complex, first, next, sorted;
+    std::vector<int32_t> row, column;          // places of the window's cells in the ring
     std::vector<Waiting> waiting;              // of `complex`
     std::vector<std::vector<int32_t>> with_levels;  // cells, of each part of the window
+    std::vector<std::vector<Cluster>> clusters;    // of a cell, for each part of the window
     Search search;
 };
 
@@ -44,7 +48,8 @@ struct Map {
     Sights sights;
     float base[3] = {};
     bool has_base = false;
-    std::vector<int32_t> row, column;  // places of the window's cells in the ring
+    std::vector<int32_t>& row = own.row;
+    std::vector<int32_t>& column = own.column;
     int64_t statistics[STATISTICS] = {};
 
     Map(const Update& u, int64_t b, int num_threads, Scratch& own)

@@ -97,7 +97,7 @@ struct Scan : Map {
 
     void span_cells() {
         own.bottom.resize(cells), own.top.resize(cells), own.all_above.resize(cells);
-        own.number.assign(cells, 0), own.touched.clear();
+        own.number.assign(cells, 0), own.touched.clear(), own.touched.reserve(std::min(cells, M));
         for (int64_t m = 0; m < M; m++) {
             const int32_t c = own.points.cell[m];
             if (c < 0) continue;

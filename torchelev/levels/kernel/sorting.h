@@ -35,7 +35,9 @@ struct Sorting : Scan {
     void sort_points() {
         std::fill_n(u.aside + b * M, M, 0);
         own.list.assign(cells, -1), own.complex.clear(), own.first.assign(1, 0);
-        own.simple.resize(own.touched.size());
+        const int64_t most = std::min(cells, M);  // reserved at once: later updates of this size allocate nothing
+        for (std::vector<int32_t>* values : {&own.complex, &own.first, &own.next}) values->reserve(most + 1);
+        own.simple.resize(most), own.waiting.reserve(most), own.sorted.resize(M), own.clusters.resize(parts.number);
         parts(int64_t(own.touched.size()), [&](int64_t, int64_t begin, int64_t end) {
             for (int64_t k = begin; k < end; k++) own.simple[k] = is_simple(own.touched[k]);
         });
@@ -47,17 +49,18 @@ struct Sorting : Scan {
         }
         own.waiting.assign(own.complex.size(), {0, 0});
         if (own.complex.empty()) return;
-        own.sorted.resize(own.first.back());
-        std::vector<int32_t> next(own.first.begin(), own.first.end() - 1);
+        own.next.assign(own.first.begin(), own.first.end() - 1);
         for (int64_t m = 0; m < M; m++) {
             const int32_t c = own.points.cell[m];
-            if (c >= 0 && own.list[c] >= 0) own.sorted[next[own.list[c]]++] = int32_t(m);
+            if (c >= 0 && own.list[c] >= 0) own.sorted[own.next[own.list[c]]++] = int32_t(m);
         }
         std::atomic<int64_t> opened{0}, dropped{0};
-        parts(int64_t(own.complex.size()), [&](int64_t, int64_t begin, int64_t end) {
+        parts(int64_t(own.complex.size()), [&](int64_t part, int64_t begin, int64_t end) {
             int64_t of_part[STATISTICS] = {};
-            for (int64_t k = begin; k < end; k++)
-                sort_cell(own.complex[k], own.first[k], own.first[k + 1], own.waiting[k], of_part);
+            for (int64_t k = begin; k < end; k++) {
+                find_clusters(own.first[k], own.first[k + 1], own.clusters[part]);
+                sort_cell(own.complex[k], own.clusters[part], own.waiting[k], of_part);
+            }
             opened += of_part[OPENED], dropped += of_part[DROPPED];
         });
         statistics[OPENED] += opened, statistics[DROPPED] += dropped;
@@ -69,7 +72,8 @@ struct Sorting : Scan {
         const auto is_lower = [&](int32_t a, int32_t c) { return z[a] < z[c]; };
         int32_t* const order = own.sorted.data();
         if (end - begin > FEW) {
-            std::stable_sort(order + begin, order + end, is_lower);
+            const auto comes_before = [&](int32_t a, int32_t c) { return z[a] == z[c] ? a < c : is_lower(a, c); };
+            std::sort(order + begin, order + end, comes_before);  // stable, and without the memory of `std::stable_sort`
         } else {
             for (int64_t k = begin + 1; k < end; k++) {
                 const int32_t m = order[k];
@@ -105,9 +109,7 @@ struct Sorting : Scan {
     }
 
     // Sort the points of a cell, by their places in `sorted`: `sort_points`.
-    void sort_cell(int64_t c, int64_t begin, int64_t end, Waiting& waiting, int64_t* numbers) {
-        static thread_local std::vector<Cluster> clusters;
-        find_clusters(begin, end, clusters);
+    void sort_cell(int64_t c, const std::vector<Cluster>& clusters, Waiting& waiting, int64_t* numbers) {
         const int64_t p = place(c);
         const Cell cell = cell_at(p);
         float g = u.elevation[b * cells + c];

@@ -13,7 +13,7 @@
  *
  * Memory: after a map, a scan or an image is created, updates and reads allocate nothing. A diagnosis does, and so do
  * the first read of a filter's layer after an update, and updates of a map with levels that meet more surfaces than those
- * before.
+ * before, or run on a thread that updated no map with levels as large before.
  */
 #ifndef TORCHELEV_H
 #define TORCHELEV_H

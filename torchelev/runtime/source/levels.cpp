@@ -3,8 +3,7 @@
 
 #include <algorithm>
 #include <cmath>
-
-#include "levels/kernel/update.h"
+#include <new>
 
 extern "C" int update_levels(const levels::Update* u, int num_threads);
 
@@ -53,10 +52,16 @@ void set_ground(const MapState& state, levels::Update& u) {
 }  // namespace
 
 MapLevels::MapLevels(const Config& cfg, const torchelev_limits& limits)
-    : cfg(cfg), H(cfg.rows()), W(cfg.columns()), L(int64_t(cfg["levels.max_levels"]) - 1), corner{-(H / 2), -(W / 2)},
-      aside(limits.max_points), statistics{} {
+    : H(cfg.rows()), W(cfg.columns()), L(int64_t(cfg["levels.max_levels"]) - 1), corner{-(H / 2), -(W / 2)},
+      aside(limits.max_points), statistics{}, fixed{} {
     for (std::vector<float>* values : {&lower, &upper, &variance, &support, &time}) values->resize(L * H * W);
     free_top.resize(H * W), is_open.resize(H * W);
+    levels::Update& u = fixed;
+    u.before = corner, u.lower = lower.data(), u.upper = upper.data(), u.level_variance = variance.data();
+    u.support = support.data(), u.time = time.data(), u.free_top = free_top.data(), u.is_open = is_open.data();
+    u.aside = aside.data(), u.statistics = statistics;
+    u.B = 1, u.H = H, u.W = W, u.L = L, u.resolution = cfg["grid.resolution"];
+    set_sensor(cfg, u), set_surfaces(cfg, u), set_tables(cfg, u);
     forget();
 }
 
@@ -67,16 +72,11 @@ void MapLevels::forget() {
 }
 
 void MapLevels::sort_points(const MapState& state, const Sizes& sizes, Inputs& inputs, int num_threads) {
-    levels::Update u{};
+    levels::Update u = fixed;
     u.points = inputs.points, u.T_map_sensor = inputs.T_map_sensor, u.T_map_base = inputs.T_map_base;
     u.variance = inputs.variance, u.own = inputs.own, u.dt = inputs.dt;
+    u.S = sizes.S, u.N = sizes.N;
     set_ground(state, u);
-    u.before = corner, u.lower = lower.data(), u.upper = upper.data(), u.level_variance = variance.data();
-    u.support = support.data(), u.time = time.data(), u.free_top = free_top.data(), u.is_open = is_open.data();
-    u.aside = aside.data(), u.statistics = statistics;
-    u.B = 1, u.S = sizes.S, u.N = sizes.N, u.H = H, u.W = W, u.L = L, u.resolution = cfg["grid.resolution"];
-    set_sensor(cfg, u), set_surfaces(cfg, u), set_tables(cfg, u);
-    std::fill_n(aside.begin(), sizes.M, 0);
     if (update_levels(&u, num_threads)) throw std::bad_alloc();
     inputs.aside = aside.data();
 }
@@ -86,32 +86,44 @@ void MapLevels::raise(float height) {
         for (float& value : *values) value += height;
 }
 
+bool MapLevels::holds(const MapState& state, int64_t cell) const {
+    const int64_t x = state.corner[0] + cell / W, y = state.corner[1] + cell % W;
+    return x >= corner[0] && x < corner[0] + H && y >= corner[1] && y < corner[1] + W;
+}
+
 int64_t MapLevels::place(const MapState& state, int64_t cell) const {
     const int64_t x = state.corner[0] + cell / W, y = state.corner[1] + cell % W;
-    if (x < corner[0] || x >= corner[0] + H || y < corner[1] || y >= corner[1] + W) return -1;
     return (x % H + H) % H * W + (y % W + W) % W;
 }
 
-void MapLevels::forget_cell(const MapState& state, int64_t cell) {
-    const int64_t p = place(state, cell);
-    if (p < 0) return;
+void MapLevels::blank(int64_t place) {
     for (std::vector<float>* values : {&lower, &upper, &variance, &support, &time})
-        for (int64_t l = 0; l < L; l++) (*values)[l * H * W + p] = 0;
-    free_top[p] = -INFINITY, is_open[p] = 0;
+        for (int64_t l = 0; l < L; l++) (*values)[l * H * W + place] = 0;
+    free_top[place] = -INFINITY, is_open[place] = 0;
+}
+
+void MapLevels::follow(const MapState& state) {
+    for (int64_t cell = 0; cell < H * W; cell++)
+        if (!holds(state, cell)) blank(place(state, cell));
+    std::copy_n(state.corner, 2, corner);
+}
+
+void MapLevels::forget_cell(const MapState& state, int64_t cell) {
+    if (holds(state, cell)) blank(place(state, cell));
 }
 
 Ceiling MapLevels::ceiling(const MapState& state, int64_t cell) const {
     const bool has_floor = state.validity[cell] || state.bounded[cell];
     const float floor = state.validity[cell] ? state.elevation[cell] : state.upper_bound[cell];
-    const float least = float(std::max(cfg["levels.min_support"], 0.5));
+    if (!has_floor || !holds(state, cell)) return {INFINITY, false};
+    const float least = std::max(fixed.min_support, 0.5f);
     const int64_t p = place(state, cell);
     float lowest = INFINITY;
-    for (int64_t l = 0; p >= 0 && l < L; l++) {
+    for (int64_t l = 0; l < L; l++) {
         const int64_t q = l * H * W + p;
         if (support[q] >= least && lower[q] > floor) lowest = std::min(lowest, lower[q]);
     }
-    const bool is_free = p >= 0 && free_top[p] >= floor + float(cfg["levels.min_gap"]);
-    return {lowest, has_floor && (lowest < INFINITY || is_free)};
+    return {lowest, lowest < INFINITY || free_top[p] >= floor + fixed.min_gap};
 }
 
 std::vector<Stored> MapLevels::stored() {

@@ -1,10 +1,9 @@
 // The surfaces of a map besides its ground, kept between updates: levels/module.py.
 #pragma once
 
-#include <memory>
-#include <string>
 #include <vector>
 
+#include "levels/kernel/update.h"
 #include "runtime/source/config.h"
 
 // A tensor as files and readers see it.
@@ -29,20 +28,23 @@ struct Ceiling {
 };
 
 class MapLevels {
-    const Config& cfg;
     int64_t H, W, L;
     int64_t corner[2];  // of the window that the rings hold
     std::vector<float> lower, upper, variance, support, time, free_top;
     std::vector<uint8_t> is_open, aside;
-    int64_t statistics[5];
+    int64_t statistics[levels::STATISTICS];
+    levels::Update fixed;  // what all updates share: the settings, and the memory above
 
-    int64_t place(const MapState& state, int64_t cell) const;  // in the ring; -1 outside of its window
+    bool holds(const MapState& state, int64_t cell) const;     // whether a cell of the map lies in the rings' window
+    int64_t place(const MapState& state, int64_t cell) const;  // of a cell of the map in the rings
+    void blank(int64_t place);
 
   public:
     MapLevels(const Config& cfg, const torchelev_limits& limits);
 
     // Take the points of other surfaces out of an update of a recentred map, and choose its ground, in place.
     void sort_points(const MapState& state, const Sizes& sizes, Inputs& inputs, int num_threads);
+    void follow(const MapState& state);  // to the window of a map that moved besides updates
     void raise(float height);  // [m] as drift compensation raised the ground
     void forget();
     void forget_cell(const MapState& state, int64_t cell);

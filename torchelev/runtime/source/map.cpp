@@ -61,23 +61,21 @@ float normal_component(float gx, float gy, int axis) {
 // Creation -----------------------------------------------------------------------------------------------------------
 
 torchelev_map::torchelev_map(const std::string& text, const std::string& where, const torchelev_limits* given)
-    : cfg(text, where), settings(settings_of(cfg)), sizes{}, limits(checked_limits(given)),
+    : cfg(text, where), settings(settings_of(cfg)), sizes{}, limits(checked_limits(given)), dt(0),
       filters(cfg.filters.items, {cfg.rows(), cfg.columns(), settings.measure.resolution},
               layers_of(cfg)) {
     sizes.B = 1, sizes.H = cfg.rows(), sizes.W = cfg.columns();
     void* addresses[NUMBER_OF_TENSORS];
     for (size_t k = 0; k < NUMBER_OF_TENSORS; k++) {
-        tensors.emplace_back(new unsigned char[bytes(k)]);
-        addresses[k] = tensors.back().get();
-    }
-    static_assert(sizeof(MapState) == sizeof addresses && std::size(STATE) == NUMBER_OF_TENSORS);
-    std::memcpy(static_cast<void*>(&state), addresses, sizeof state);
-    for (size_t k = 0; k < NUMBER_OF_TENSORS; k++) {
         std::vector<int64_t> shape;
         for (const int64_t size : STATE[k].shape)
             if (size) shape.push_back(size == ROWS ? sizes.H : size == COLUMNS ? sizes.W : size);
-        stored.push_back({STATE[k].name, STATE[k].dtype, shape, addresses[k], STATE[k].size, false});
+        stored.push_back({STATE[k].name, STATE[k].dtype, shape, nullptr, STATE[k].size, false});
+        tensors.emplace_back(new unsigned char[stored[k].bytes()]);
+        stored[k].data = addresses[k] = tensors[k].get();
     }
+    static_assert(sizeof(MapState) == sizeof addresses && std::size(STATE) == NUMBER_OF_TENSORS);
+    std::memcpy(static_cast<void*>(&state), addresses, sizeof state);
     if (cfg.has_levels()) levels = std::make_unique<MapLevels>(cfg, limits);
     if (levels)
         for (const Stored& tensor : levels->stored()) stored.push_back(tensor);
@@ -90,13 +88,6 @@ torchelev_map::torchelev_map(const std::string& text, const std::string& where, 
     forget();
 }
 
-int64_t torchelev_map::count(size_t k) const {
-    int64_t count = 1;
-    for (const int64_t size : STATE[k].shape)
-        count *= size == ROWS ? sizes.H : size == COLUMNS ? sizes.W : size > 0 ? size : 1;
-    return count;
-}
-
 const Stored& torchelev_map::find(const std::string& name) const {
     const auto found = std::find_if(stored.begin(), stored.end(), [&](const Stored& one) { return name == one.name; });
     REQUIRE(found != stored.end(), "name", "must be a tensor of MapState", "'" + name + "'", "use elevation");
@@ -104,7 +95,7 @@ const Stored& torchelev_map::find(const std::string& name) const {
 }
 
 void torchelev_map::forget() {
-    for (size_t k = 0; k < NUMBER_OF_TENSORS; k++) fill_tensor(STATE[k], tensors[k].get(), count(k));
+    for (size_t k = 0; k < NUMBER_OF_TENSORS; k++) fill_tensor(STATE[k], tensors[k].get(), stored[k].count());
     state.corner[0] = -(sizes.H / 2), state.corner[1] = -(sizes.W / 2);
     if (levels) levels->forget();
     history.forget(), filters.forget();
@@ -235,6 +226,7 @@ void torchelev_map::move(const double* T_map_base) {
     const torchelev_input input{1, 0, nullptr, T_map_base, T_map_base, nullptr, 0, nullptr, nullptr};
     const Stage stages[] = {run_measure, run_recenter};
     run(input, stages, std::size(stages));
+    if (levels) levels->follow(state);
 }
 
 // Mark the points on the robot's links: `find_own` of measure/stage.py.
@@ -247,7 +239,14 @@ void torchelev_map::find_own(const torchelev_input& input) {
     }
 }
 
-Inputs torchelev_map::inputs_of(const torchelev_input& input, float& dt) {
+void torchelev_map::set_sizes(const torchelev_input& input) {
+    sizes.K = input.T_base_links ? int64_t(cfg.body.links.size()) : 0;
+    sizes.S = input.num_sensors, sizes.N = input.num_points, sizes.M = sizes.S * sizes.N;
+    sizes.P = sizes.S > 1 ? sizes.S : 0;
+}
+
+// The input as stages read it; what the input gives in another type is copied into the map.
+Inputs torchelev_map::inputs_of(const torchelev_input& input) {
     Inputs inputs{};
     inputs.points = const_cast<float*>(input.points), inputs.variance = const_cast<float*>(input.variance);
     inputs.T_map_sensor = const_cast<double*>(input.T_map_sensor);
@@ -261,15 +260,12 @@ Inputs torchelev_map::inputs_of(const torchelev_input& input, float& dt) {
         find_own(input);
         inputs.own = on_robot.data(), inputs.T_base_links = const_cast<double*>(input.T_base_links);
     }
-    sizes.K = input.T_base_links ? int64_t(cfg.body.links.size()) : 0;
-    sizes.S = input.num_sensors, sizes.N = input.num_points, sizes.M = sizes.S * sizes.N;
-    sizes.P = sizes.S > 1 ? sizes.S : 0;
     return inputs;
 }
 
 void torchelev_map::run(const torchelev_input& input, const Stage* stages, int64_t number) {
-    float dt;
-    Update one{settings, sizes, state, inputs_of(input, dt), own.measurement, own.memory, limits.num_threads};
+    set_sizes(input);
+    Update one{settings, sizes, state, inputs_of(input), own.measurement, own.memory, limits.num_threads};
     filters.forget();
     run_stages(one, stages, number);
 }
@@ -281,8 +277,8 @@ void torchelev_map::run_update(const torchelev_input& input) {
     window.num_points = 0, window.variance = nullptr, window.T_base_links = nullptr;
     const Stage follow[] = {run_measure, run_recenter};
     run(window, follow, std::size(follow));
-    float dt;
-    Inputs inputs = inputs_of(input, dt);
+    set_sizes(input);
+    Inputs inputs = inputs_of(input);
     levels->sort_points(state, sizes, inputs, limits.num_threads);
     Update one{settings, sizes, state, inputs, own.measurement, own.memory, limits.num_threads};
     run_stages(one, ORDER, std::size(ORDER));

@@ -46,6 +46,7 @@ struct torchelev_map {
     MapState state;                                         // their addresses
     std::unique_ptr<MapLevels> levels;                      // null without other surfaces than the ground
     std::vector<Stored> stored;                             // all tensors, those of the levels last
+    float dt;                                               // [s] of the input
     std::vector<float> covariance;                          // (S, 6, 6) of the input
     std::vector<uint8_t> on_robot;                          // (S, N) of the input, with shapes of links
     robot_body::Posed posed;
@@ -58,8 +59,6 @@ struct torchelev_map {
 
     int64_t cells() const { return sizes.H * sizes.W; }
     double resolution() const { return settings.measure.resolution; }
-    int64_t count(size_t k) const;  // of a tensor's elements
-    size_t bytes(size_t k) const { return count(k) * STATE[k].size; }
     const Stored& find(const std::string& name) const;  // a tensor; raises Error
     void forget();                                      // make the map blank
     void update(const torchelev_input& input);
@@ -78,7 +77,8 @@ struct torchelev_map {
     void find_own(const torchelev_input& input);
     void run(const torchelev_input& input, const Stage* stages, int64_t number);
     void run_update(const torchelev_input& input);
-    Inputs inputs_of(const torchelev_input& input, float& dt);
+    void set_sizes(const torchelev_input& input);
+    Inputs inputs_of(const torchelev_input& input);
     void warm_up();
     template <class Change>
     void revise(const Change& change);
