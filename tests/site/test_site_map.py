@@ -526,3 +526,16 @@ def test_what_was_given_without_a_pose_stays_where_it_was_as_the_window_moves():
     assert not report.new_cells.any()
     aged = {cell: value + emap.cfg.aging.variance_rate for cell, value in before.items()}
     assert known_cells(site, "variance") == pytest.approx(aged, rel=1e-4)
+
+
+def test_a_map_in_double_precision_merges_as_one_in_single():
+    single = robots([(0, 0), (10, -5)], cells=(20, 30), known=0.8)
+    single.state.bounded.copy_(~single.state.validity)
+    double = copy.deepcopy(single).double()
+    sites = SiteMap(0.1), SiteMap(0.1)
+    for site, emap in zip(sites, (single, double), strict=True):
+        site.merge(emap, align=False)
+    for layer in ("elevation", "upper_bound"):
+        one, other = (known_cells(site, layer) for site in sites)
+        assert one and one.keys() == other.keys()
+        assert all(other[cell] == pytest.approx(value, abs=1e-6) for cell, value in one.items())

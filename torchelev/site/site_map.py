@@ -147,7 +147,7 @@ class SiteMap(OpenedSite):
         the site keeps are those of its elevation: means by weight, counts of classes added up, the largest of maxima,
         and of "exponential" and "class_average" what was measured last. Maps may lack channels that the site keeps.
         A site with levels takes all surfaces of maps with levels, and the ground of others; the lowest surface of each
-        cell is its ground.
+        cell is its ground. Surfaces are told apart by the site's `min_gap`, whatever those of the maps are.
 
         Args:
             emap: the map, of the site's resolution. The site recognises it, not copies of it.

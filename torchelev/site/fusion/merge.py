@@ -105,5 +105,5 @@ def lower_bounds(layers: Float[Tensor, "L C"], cell: Int[Tensor, "U"], heights: 
     """Lower the upper bounds of unknown cells to these heights, in place."""
     if not len(cell):
         return
-    bound = layers[_BOUND].nan_to_num(nan=torch.inf).scatter_reduce(0, cell, heights, "amin")
+    bound = layers[_BOUND].nan_to_num(nan=torch.inf).scatter_reduce(0, cell, heights.to(layers.dtype), "amin")
     layers[_BOUND] = torch.where((layers[_TIME] == layers[_TIME]) | (bound == torch.inf), torch.nan, bound)
