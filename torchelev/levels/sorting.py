@@ -75,8 +75,7 @@ def sort_points(levels: Levels, state: MapState, scan: Scan, cfg: ElevationMapCo
         to_ground = (dg <= own.min_gap) & (dg <= dl)
         to_level = (there > 0) & ~to_ground & (dl <= own.min_gap)
         above = known & (found.lower > g)
-        is_free = levels.is_open | (levels.free_top >= g + own.min_gap)
-        shown = torch.where(known & ~above, scan.ground_floats, flies | (above & is_free))
+        shown = torch.where(known & ~above, scan.ground_floats, flies | (above & levels.is_open))
         if own.separation == "gap":
             shown = shown | known | (rank > 0)
         opens = (there > 0) & ~to_ground & ~to_level & (shown | (ramp & ~known))

@@ -138,8 +138,7 @@ struct Sorting : Scan {
                 if (stands) found_ground(c, nearest), known = true, g = u.elevation[b * cells + c];
             } else {
                 const bool above = known && found.lower > g;
-                const bool is_free = is_open(p) || free_top(p) >= g + u.min_gap;
-                bool shown = known && !above ? ground_floats : (above && is_free) || floats(c, found.lower);
+                bool shown = known && !above ? ground_floats : (above && is_open(p)) || floats(c, found.lower);
                 shown |= (!known && clusters[rank].above) || (u.by_gap && (known || rank > 0));
                 if (!shown) {
                     if (!known && !(waiting.number > 0)) waiting = {found.mean, found.number};
