@@ -56,7 +56,7 @@ def test_a_scan_of_open_sky_reads_no_ceiling(under):
 
 def test_a_scan_of_the_ceiling_needs_levels(under):
     plain = ElevationMap(ElevationMapConfig(grid=GRID))
-    with pytest.raises(KeyError, match="LevelsConfig"):
+    with pytest.raises(ValueError, match="surface: needs a map with levels.*LevelsConfig"):
         HeightScan.grid(surface="ceiling")(plain, under[1])
     with pytest.raises(ValueError, match="must be one of ground, ceiling"):
         HeightScan.grid(surface="sky")

@@ -31,25 +31,25 @@ SAME = 0.1  # [m] by which points may miss the ground and still show that it is 
 class Scan(NamedTuple):
     """A scan over the window."""
 
-    clusters: Clusters
-    floating: Bool[Tensor, "B M"]  # clusters below which rays passed
-    ground_floats: Bool[Tensor, "B cells"]
-    sights: list[Sight]
-    rays: RayHeights
-    x: Float[Tensor, "B cells"]  # centres of the cells [m]
-    y: Float[Tensor, "B cells"]
+    clusters: Clusters  #: of its points in each cell
+    floating: Bool[Tensor, "B M"]  #: clusters below which rays passed
+    ground_floats: Bool[Tensor, "B cells"]  #: cells below whose ground rays passed
+    sights: list[Sight]  #: what the rays of each sensor saw
+    rays: RayHeights  #: the highest and the lowest ray over each cell
+    x: Float[Tensor, "B cells"]  #: [m] centres of the cells
+    y: Float[Tensor, "B cells"]  #: [m] centres of the cells
 
 
 class SortedPoints(NamedTuple):
     """Points that were sorted into the ground and other surfaces."""
 
-    levels: Levels
-    state: MapState
-    aside: Bool[Tensor, "B M"]  # points that do not measure the ground
-    waiting: Float[Tensor, "B cells"]  # points that will found the ground where that is not known
-    height: Float[Tensor, "B cells"]  # [m] of these
-    opened: Int[Tensor, "B"]
-    dropped: Int[Tensor, "B"]
+    levels: Levels  #: with these points
+    state: MapState  #: of the map, without ground below which rays passed
+    aside: Bool[Tensor, "B M"]  #: points that do not measure the ground
+    waiting: Float[Tensor, "B cells"]  #: number of points that will found the ground where it is not known
+    height: Float[Tensor, "B cells"]  #: [m] of these
+    opened: Int[Tensor, "B"]  #: surfaces found
+    dropped: Int[Tensor, "B"]  #: surfaces for which a cell had no place
 
 
 def sort_points(levels: Levels, state: MapState, scan: Scan, cfg: ElevationMapConfig) -> SortedPoints:

@@ -44,6 +44,8 @@ def read_scan(
     inputs = ScanInputs(current, emap.cfg.grid, T_map_base, feet, draws)
     fill = scan.original if scan.fill == ORIGINAL else scan.fill
     if scan.surface == "ceiling":
+        hint = "give the config levels=LevelsConfig(max_levels=3)"
+        require(emap.levels is not None, "surface", "needs a map with levels", "'ceiling' of a map without", hint)
         heights = _read_ceiling(scan, inputs, emap.read_layer("ceiling", state, levels))
     elif can_read(fill, inputs):
         heights = read_in_cpp(scan, fill, _value_of_unknown(scan, fill), inputs)

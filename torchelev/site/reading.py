@@ -57,7 +57,12 @@ def check_layers(layers: Sequence[str] | None, tiles: Tiles) -> tuple[str, ...]:
 def check_layer(argument: str, name: str, tiles: Tiles) -> str:
     """Return the name of a layer; KeyError if it does not exist."""
     names = all_layers(tiles)
-    require(name in names, argument, f"must be one of {', '.join(names)}", repr(name), "check its spelling", KeyError)
+    hint = (
+        "begin the site with levels=LevelsConfig()"
+        if name in LEVEL_LAYERS and not tiles.levels
+        else "check its spelling"
+    )
+    require(name in names, argument, f"must be one of {', '.join(names)}", repr(name), hint, KeyError)
     return name
 
 

@@ -38,7 +38,7 @@ class SiteLevels:
     """
 
     def __init__(self, cfg: LevelsConfig | None) -> None:
-        hint = "give LevelsConfig(max_levels=3), say"
+        hint = "give LevelsConfig(max_levels=3), for example"
         is_config = cfg is None or isinstance(cfg, LevelsConfig)
         require(is_config, "levels", "must be a LevelsConfig", type(cfg).__name__, hint, TypeError)
         self.cfg = cfg if cfg is not None and cfg.others else None
