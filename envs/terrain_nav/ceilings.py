@@ -25,8 +25,8 @@ def count_channels(cfg: TerrainNavConfig) -> int:
 
 def make_reader(cfg: TerrainNavConfig, crop: MapImage) -> Reader | None:
     """Return what reads the channels (B, C, n, n) from maps with levels at the crop's pixels; None for none."""
-    readers = {"none": None, "scan": _read_scan(cfg, crop), "drop": _read_drop(cfg, crop), "voxels": _read_voxels(cfg)}
-    return readers[cfg.sight.ceilings]
+    shown = cfg.sight.ceilings
+    return None if shown == "none" else _READERS[shown](cfg, crop)
 
 
 def _read_scan(cfg: TerrainNavConfig, crop: MapImage) -> Reader:
@@ -52,7 +52,7 @@ def _read_drop(cfg: TerrainNavConfig, crop: MapImage) -> Reader:
     return read
 
 
-def _read_voxels(cfg: TerrainNavConfig) -> Reader:
+def _read_voxels(cfg: TerrainNavConfig, crop: MapImage) -> Reader:
     """Return 1 where a voxel over the pixel is occupied, else 0: a channel for each layer of voxels, from below."""
     sight = cfg.sight
     voxels = VoxelCrop(
@@ -68,3 +68,6 @@ def _read_voxels(cfg: TerrainNavConfig) -> Reader:
         return torch.nn.functional.max_pool2d(is_occupied, _FINER)
 
     return read
+
+
+_READERS = {"scan": _read_scan, "drop": _read_drop, "voxels": _read_voxels}

@@ -52,6 +52,14 @@ def test_robots_pass_under_and_beside(height, y):
     assert bool(outcome.success) and not bool(outcome.bumped)
 
 
+def test_pixels_in_which_voxels_do_not_fit_need_no_voxels():
+    sight = SightConfig(crop_length=3.0, crop_resolution=0.25)
+    task = TerrainNav(TerrainNavConfig(course=FLAT, sight=sight), 1)
+    assert task.observe()["map"].shape == (1, 4, 12, 12)
+    with pytest.raises(ValueError, match="length_z: must be a whole number of times 0.125 m"):
+        TerrainNav(TerrainNavConfig(course=FLAT, sight=dataclasses.replace(sight, ceilings="voxels")), 1)
+
+
 def test_open_courses_have_no_bumps():
     task = TerrainNav(TerrainNavConfig(course=FLAT), 2, perception="blind")
     outcome = task.advance(torch.ones(2, 2))
