@@ -128,6 +128,8 @@ BAD = [
     {"levels": {"max_levels": 9}},
     {"levels": {"max_levels": 0}},
     {"levels": {"min_gap": 0.0}},
+    {"levels": {"min_gap": 400.0}},
+    {"levels": {"max_step": 20.5}},
     {"levels": {"max_step": "inf"}},
     {"levels": {"max_blind": -1.0}},
     {"levels": {"min_support": "inf"}},

@@ -21,7 +21,7 @@ from torchelev.inputs.checks import FARTHEST
 from torchelev.kernels.cpu_update import Inputs
 from torchelev.kernels.registry import header
 from torchelev.kernels.structs import Double, members
-from torchelev.levels.config import MAX_LEVELS, SEPARATIONS
+from torchelev.levels.config import MAX_HEIGHT, MAX_LEVELS, SEPARATIONS
 from torchelev.observations import presets
 from torchelev.observations.ground import MARGIN, MAX_BLOCK
 from torchelev.observations.height_scan import HeightScan
@@ -54,6 +54,7 @@ _CONSTANTS: tuple[tuple[str, str, float], ...] = (
     ("int", "MAX_REFINEMENTS", MAX_REFINEMENTS),
     ("int", "MAX_CELLS", MAX_CELLS),  # of a ray
     ("int", "MAX_LEVELS", MAX_LEVELS),
+    ("double", "MAX_HEIGHT", MAX_HEIGHT),  # [m] of a gap or a step of levels
     ("double", "MIN_RESOLUTION", MIN_RESOLUTION),  # [m]
     ("double", "FARTHEST", FARTHEST),  # [m]
     ("double", "STEP_REACH", STEP_REACH),  # [m]

@@ -133,6 +133,7 @@ constexpr int MAX_RADIUS = 1000;
 constexpr int MAX_REFINEMENTS = 100;
 constexpr int MAX_CELLS = 16384;
 constexpr int MAX_LEVELS = 8;
+constexpr double MAX_HEIGHT = 20.0;
 constexpr double MIN_RESOLUTION = 0.0001;
 constexpr double FARTHEST = 1000000000.0;
 constexpr double STEP_REACH = 0.1;

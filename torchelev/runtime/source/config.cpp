@@ -289,8 +289,10 @@ void Config::check_levels() const {
     require_rule(1 <= cfg["levels.max_levels"] && cfg["levels.max_levels"] <= MAX_LEVELS, "levels.max_levels",
                  "must be a whole number from 1 to " + std::to_string(MAX_LEVELS),
                  "3 hold ground, table and ceiling; each more costs time and 20 bytes a cell");
-    for (const char* name : {"levels.min_gap", "levels.max_step"})
+    for (const char* name : {"levels.min_gap", "levels.max_step"}) {
         require_rule(cfg[name] > 0 && std::isfinite(cfg[name]), name, "must be a positive number", "give metres");
+        require_rule(cfg[name] <= MAX_HEIGHT, name, "must be at most " + general(MAX_HEIGHT) + " m", "give metres");
+    }
     for (const char* name : {"levels.max_blind", "levels.min_support"})
         require_rule(0 <= cfg[name] && std::isfinite(cfg[name]), name, "must be finite and not negative",
                      "leave it out for the default");
