@@ -132,9 +132,7 @@ def sample_lowest(layer: Layer, uv: Float[Tensor, "B M 2"], grid: GridConfig, mo
     """
     corners = _drop_unknown(_find_corners(uv, grid, mode), layer[1])
     read = layer[0].flatten(1).gather(1, corners.cell)
-    lowest = torch.where(corners.counts, read, torch.inf).view_as(corners.weight).amin(1)
-    valid = corners.weight.sum(1) >= 0.5
-    return torch.where(valid, lowest, 0.0), valid
+    return lowest_counting(read.view_as(corners.weight), corners.counts.view_as(corners.weight), corners.weight)
 
 
 def _find_corners(uv: Tensor, grid: GridConfig, mode: str) -> _Corners:
@@ -158,6 +156,14 @@ def _average(values: Tensor, corners: _Corners) -> Layer:
     read = values.flatten(1).gather(1, corners.cell)
     corner = torch.where(corners.counts, read, 0.0).view_as(corners.weight)  # what is unknown must not reach gradients
     return weighted_mean(corner, corners.weight)
+
+
+def lowest_counting(
+    values: Float[Tensor, "B K M"], counts: Bool[Tensor, "B K M"], weight: Float[Tensor, "B K M"]
+) -> Layer:
+    """Return the lowest over K of the values that count, which may be infinite, and where `weighted_mean` is valid."""
+    valid = weight.sum(1) >= 0.5
+    return torch.where(valid, torch.where(counts, values, torch.inf).amin(1), 0.0), valid
 
 
 def weighted_mean(values: Float[Tensor, "B K M"], weight: Float[Tensor, "B K M"]) -> Layer:

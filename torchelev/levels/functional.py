@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from torchelev.errors import require
-from torchelev.levels.state import Levels, move, raise_by
+from torchelev.levels.state import Levels, move, rises
 from torchelev.levels.step import update_levels
 from torchelev.stages.measure.stage import set_aside
 from torchelev.stages.recenter.stage import recenter
@@ -36,14 +36,11 @@ def forward(
     """
     moved = recenter(state, m, cfg.grid)
     step = update_levels(move(levels, moved.corner - state.corner), moved, m, cfg)
-    state = run(step.state, set_aside(m, step.aside))
-    return state, follow_drift(step.levels, state, cfg)
-
-
-def follow_drift(levels: Levels, state: MapState, cfg: ElevationMapConfig) -> Levels:
-    """Return levels raised as drift compensation raised the ground in the last update of a state."""
-    height = state.statistics.drift_correction.to(levels.lower.dtype)
-    return levels if cfg.drift is None else raise_by(levels, height)
+    state, levels = run(step.state, set_aside(m, step.aside)), step.levels
+    if cfg.drift is not None:
+        steps = rises(state.statistics.drift_correction.to(levels.lower.dtype))
+        levels = levels._replace(**{name: getattr(levels, name) + step for name, step in steps.items()})
+    return state, levels
 
 
 def require_levels(levels: Levels, state: MapState, cfg: ElevationMapConfig) -> None:

@@ -18,6 +18,7 @@ from torchelev.levels.state import (
     forget_space,
     move,
     remove,
+    rises,
     turn,
 )
 from torchelev.levels.step import update_levels
@@ -103,12 +104,9 @@ class MapLevels(nn.Module):
     @torch.no_grad()
     def follow_drift(self, state: MapState) -> None:
         """Raise all surfaces as drift compensation raised the ground in an update."""
-        if self.cfg.drift is None:
-            return
-        height = state.statistics.drift_correction.float()
-        self.lower.add_(height[:, None, None, None])
-        self.upper.add_(height[:, None, None, None])
-        self.free_top.add_(height[:, None, None])
+        if self.cfg.drift is not None:
+            for name, step in rises(state.statistics.drift_correction.float()).items():
+                getattr(self, name).add_(step)
 
     @torch.no_grad()
     def follow(self, state: MapState) -> None:

@@ -136,17 +136,37 @@ class RayHeights(NamedTuple):
     lowest: Float[Tensor, "B cells"]  #: [m] inf: none
 
 
+class Over(NamedTuple):
+    """The directions in which cells lie for one sensor."""
+
+    d: Float[Tensor, "B cells"]  #: [m] horizontal distance
+    z: Float[Tensor, "B 1"]  #: [m] height of the sensor
+    azimuth: Int[Tensor, "B cells"]  #: bin
+    place: Int[Tensor, "B cells"]  #: entry of the rays that end more than a cell behind, in `highest` and `lowest`
+
+    def highest(self, sight: Sight) -> Float[Tensor, "B cells"]:
+        """Return the height of the highest ray over each cell [m]; -inf: none."""
+        return self.z + (sight.highest.gather(1, self.place) * self.d).nan_to_num(-torch.inf, torch.inf, -torch.inf)
+
+    def lowest(self, sight: Sight) -> Float[Tensor, "B cells"]:
+        """Return the height of the lowest ray over each cell [m]; inf: none."""
+        return self.z + (sight.lowest.gather(1, self.place) * self.d).nan_to_num(torch.inf, torch.inf, -torch.inf)
+
+
+def look_over(sight: Sight, x: Tensor, y: Tensor, size: SightGrid) -> Over:
+    """Return in which directions of a sensor cells with these centres (B, cells) [m] lie."""
+    dx, dy = x - sight.origin[:, 0, None], y - sight.origin[:, 1, None]
+    d, azimuth = horizontal(dx, dy), azimuth_bin(dx, dy, size)
+    row = (d / size.resolution + MARGIN).to(torch.int64).clamp(max=size.ranges - 1)
+    return Over(d, sight.origin[:, 2, None], azimuth, row * size.azimuths + azimuth)
+
+
 def ray_heights(sights: list[Sight], x: Tensor, y: Tensor, size: SightGrid) -> RayHeights:
     """Return the heights of the highest and the lowest ray over cells with these centres (B, cells) [m]."""
     highest, lowest = torch.full_like(x, -torch.inf), torch.full_like(x, torch.inf)
     for sight in sights:
-        dx, dy = x - sight.origin[:, 0, None], y - sight.origin[:, 1, None]
-        d, z = horizontal(dx, dy), sight.origin[:, 2, None]
-        row = (d / size.resolution + MARGIN).to(torch.int64).clamp(max=size.ranges - 1)
-        place = row * size.azimuths + azimuth_bin(dx, dy, size)
-        up, down = (slopes.gather(1, place) * d for slopes in (sight.highest, sight.lowest))
-        highest = torch.maximum(highest, z + up.nan_to_num(nan=-torch.inf, posinf=torch.inf, neginf=-torch.inf))
-        lowest = torch.minimum(lowest, z + down.nan_to_num(nan=torch.inf, posinf=torch.inf, neginf=-torch.inf))
+        over = look_over(sight, x, y, size)
+        highest, lowest = torch.maximum(highest, over.highest(sight)), torch.minimum(lowest, over.lowest(sight))
     return RayHeights(highest, lowest)
 
 
@@ -161,8 +181,9 @@ def raise_free_top(
 ) -> Float[Tensor, "B cells"]:
     """Return up to which height the space above a floor is free, where rays show that it is more than was known [m].
 
-    Rays beyond a cell show it up to the highest of them, unless one between half of `min_gap` above the floor, or what
-    was known, and that height ends before: what hangs there is not passed by rays above it.
+    That is the highest ray that passes the cell, or below it the lowest direction in which a ray ends before the cell:
+    rays over a beam say nothing of the space below it. Directions count from half of `min_gap` above the floor, or from
+    what was known.
 
     Args:
         free_top: known before (B, cells) [m]; -inf: nothing.
@@ -174,16 +195,14 @@ def raise_free_top(
         size: of the tables.
     """
     for sight in sights:
-        dx, dy = x - sight.origin[:, 0, None], y - sight.origin[:, 1, None]
-        d, z, azimuth = horizontal(dx, dy), sight.origin[:, 2, None], azimuth_bin(dx, dy, size)
-        row = (d / size.resolution + MARGIN).to(torch.int64).clamp(max=size.ranges - 1)
-        highest = z + sight.highest.gather(1, row * size.azimuths + azimuth) * d
+        over = look_over(sight, x, y, size)
+        d, z, highest = over.d, over.z, over.highest(sight)
         begin = torch.maximum(free_top, floor + 0.5 * min_gap)
         rises = highest > torch.maximum(free_top, floor) + RISE * size.resolution
         first, last = (elevation_bin(d, h - z, size) for h in (begin, torch.maximum(begin, highest)))
         limit, behind = highest.clone(), d + MARGIN * size.resolution
         for e in reversed(range(size.elevations)):
-            ends = sight.nearest[:, e * size.azimuths :].gather(1, azimuth) < behind
+            ends = sight.nearest[:, e * size.azimuths :].gather(1, over.azimuth) < behind
             ends = ends & (first <= e) & (e <= last)
             limit = torch.where(ends, torch.minimum(highest, z + height_of(e, d, size)), limit)
         free_top = torch.where(rises, torch.maximum(free_top, limit), free_top)

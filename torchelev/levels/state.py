@@ -89,12 +89,10 @@ def age(levels: Levels, dt: Float[Tensor, "B"], variance_rate: float, max_varian
     )
 
 
-def raise_by(levels: Levels, height: Float[Tensor, "B"]) -> Levels:
-    """Return levels with all heights raised [m], as drift compensation raises the ground."""
-    step = height[:, None, None, None]
-    return levels._replace(
-        lower=levels.lower + step, upper=levels.upper + step, free_top=levels.free_top + height[:, None, None]
-    )
+def rises(height: Float[Tensor, "B"]) -> dict[str, Tensor]:
+    """Return by how much each layer of heights rises [m], as drift compensation raises the ground."""
+    of_cells, of_surfaces = height[:, None, None], height[:, None, None, None]
+    return {"lower": of_surfaces, "upper": of_surfaces, "free_top": of_cells}
 
 
 def forget_space(levels: Levels, cells: Tensor) -> Levels:

@@ -12,6 +12,7 @@ from torchelev.config import ElevationMapConfig
 from torchelev.errors import require
 from torchelev.inputs import checks
 from torchelev.layers import LAYERS, MODES, Layer, sample_layer, sample_lowest
+from torchelev.levels import HINT as LEVEL_HINT
 from torchelev.levels import LAYERS as LEVEL_LAYERS
 from torchelev.levels import views
 from torchelev.levels.functional import require_levels
@@ -162,8 +163,7 @@ class ReadableMap(MapBuffers):
 
     def read_level(self, name: str, level: int, state: MapState | None = None, levels: Levels | None = None) -> Layer:
         """Return a layer of one surface of each cell, and where there is one; arguments and errors as of `layer`."""
-        hint = "give the config levels=LevelsConfig(max_levels=3)"
-        require(self.levels is not None, "level", "needs a map with levels", repr(level), hint)
+        require(self.levels is not None, "level", "needs a map with levels", repr(level), LEVEL_HINT)
         return views.by_level(name, level, self._surfaces(state, levels))
 
     def _surfaces(self, state: MapState | None, levels: Levels | None) -> views.View:
@@ -263,7 +263,7 @@ class ReadableMap(MapBuffers):
         if name in COMPLETED:
             return "give the config a CompletionConfig"
         if name in LEVEL_LAYERS:
-            return "give the config levels=LevelsConfig(max_levels=3)"
+            return LEVEL_HINT
         return f"there are {', '.join(self.layers)}"
 
     def _complete(self, state: MapState | None = None) -> dict[str, Layer]:

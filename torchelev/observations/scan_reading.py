@@ -10,6 +10,7 @@ from torch import Tensor
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
 from torchelev.layers import Layer, sample_lowest
+from torchelev.levels import HINT as LEVEL_HINT
 from torchelev.levels.state import Levels
 from torchelev.observations.channel_reading import read_channels
 from torchelev.observations.fill import ORIGINAL, Query, fill_unknown, filled_layers, read_points
@@ -44,8 +45,8 @@ def read_scan(
     inputs = ScanInputs(current, emap.cfg.grid, T_map_base, feet, draws)
     fill = scan.original if scan.fill == ORIGINAL else scan.fill
     if scan.surface == "ceiling":
-        hint = "give the config levels=LevelsConfig(max_levels=3)"
-        require(emap.levels is not None, "surface", "needs a map with levels", "'ceiling' of a map without", hint)
+        actual = "'ceiling' of a map without"
+        require(emap.levels is not None, "surface", "needs a map with levels", actual, LEVEL_HINT)
         heights = _read_ceiling(scan, inputs, emap.read_layer("ceiling", state, levels))
     elif can_read(fill, inputs):
         heights = read_in_cpp(scan, fill, _value_of_unknown(scan, fill), inputs)

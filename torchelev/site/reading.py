@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import require
-from torchelev.layers import surrounding_cells, weighted_mean
+from torchelev.layers import lowest_counting, surrounding_cells, weighted_mean
 from torchelev.levels import LAYERS as LEVEL_LAYERS
 from torchelev.site.tiles import LAYERS as STORED
 from torchelev.site.tiles import TILE, Tiles, locate
@@ -141,12 +141,9 @@ def sample_tiles(
     stored = dict(zip(sources, looked_up, strict=True))
     values = compute_layer(name, stored, clock, tiles).view(weight.shape)
     weight = torch.where(values.isnan() | ~finite, 0.0, weight)
-    sample = _lowest if name in LEVEL_LAYERS else weighted_mean
-    found, valid = sample(torch.where(weight > 0, values, 0.0), weight)  # 0 times inf, or NaN, is NaN
+    counts = weight > 0
+    if name in LEVEL_LAYERS:
+        found, valid = lowest_counting(values, counts, weight)
+    else:
+        found, valid = weighted_mean(torch.where(counts, values, 0.0), weight)  # 0 times NaN is NaN
     return found[0].float(), valid[0]
-
-
-def _lowest(values: Float[Tensor, "B K M"], weight: Float[Tensor, "B K M"]) -> tuple[Tensor, Tensor]:
-    """Return the lowest of K values, which may be infinite, and where `weighted_mean` is valid."""
-    valid = weight.sum(1) >= 0.5
-    return torch.where(valid, torch.where(weight > 0, values, torch.inf).amin(1), 0.0), valid

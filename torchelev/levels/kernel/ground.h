@@ -26,12 +26,12 @@ struct Standing {
 // A cell with levels.
 struct Several {
     int64_t cell;
-    float height[MAX_LEVELS];     // [m] of the surfaces, 0 the ground; NaN: not there, or of too few points
-    uint16_t firm = 0;      // surfaces of many points, a bit each
-    uint16_t entered = 0;   // levels that a way from the ground may lead to, a bit each
+    float height[MAX_LEVELS];  // [m] of the surfaces, 0 the ground; NaN: not there, or of too few points
+    uint16_t firm = 0;         // surfaces of many points, a bit each
+    uint16_t entered = 0;      // levels that a way from the ground may lead to, a bit each
     bool may_change = false;   // one of them may be reached before the ground
     int8_t first = UNDECIDED;
-    int32_t decided_in = 0;  // the step in which it was reached first
+    int32_t decided_in = 0;    // the step in which it was reached first
 };
 
 // The search over the surfaces of a window, whose rim of cells without any spares the questions for its border. Its
@@ -42,6 +42,7 @@ struct Search {
     std::vector<Several> several;
     const float* support;        // (H W) of the ground
     int64_t H, W, pitch, cells;
+    int64_t sides[4];            // from a cell to those beside it
     int K;
     float max_step, rise;
     int32_t max_blind;
@@ -49,6 +50,7 @@ struct Search {
     // Begin with a window; `height` within the rim is the caller's to set, and `several` to add to.
     void start(int64_t rows, int64_t columns, int surfaces) {
         H = rows, W = columns, pitch = W + 2, cells = (H + 2) * pitch, K = surfaces;
+        sides[0] = -pitch, sides[1] = pitch, sides[2] = -1, sides[3] = 1;
         height.resize(cells), entry.assign(cells, -1), several.clear();
         std::fill_n(height.begin(), pitch, NAN), std::fill_n(height.end() - pitch, pitch, NAN);
         for (int64_t i = 0; i < H; i++) height[at(i, -1)] = height[at(i, W)] = NAN;
@@ -86,7 +88,7 @@ struct Search {
             Several& here = several[nodes.back().first];
             const int k = nodes.back().second;
             nodes.pop_back();
-            for (const int64_t away : {-pitch, pitch, int64_t(-1), int64_t(1)}) {
+            for (const int64_t away : sides) {
                 const int64_t c = here.cell + away;
                 lead_to(here, k, height[c]);
                 if (entry[c] < 0) continue;
@@ -126,7 +128,7 @@ struct Search {
     // reached; it came in this step; a level may be first.
     static constexpr uint16_t KNOWN = 1 << 12, GUESS = 1 << 13, FRESH = 1 << 14, MAY_CHANGE = 1 << 15;
     static constexpr int SHIFT = 27;
-    std::vector<uint16_t> unreached;       // (cells)
+    std::vector<uint16_t> unreached;  // (cells)
     std::vector<int32_t> blind;       // (cells) cells since the last surface
     std::vector<int32_t> wave, next;  // nodes: surface << SHIFT | cell
     std::vector<int32_t> fresh;       // cells whose guess came in this step
@@ -185,7 +187,7 @@ struct Search {
     }
 
     bool touches_ground(const Several& here, int k) const {
-        for (const int64_t away : {-pitch, pitch, int64_t(-1), int64_t(1)})
+        for (const int64_t away : sides)
             if (std::fabs(height[here.cell + away] - here.height[k]) <= max_step) return true;
         return false;
     }
@@ -217,7 +219,6 @@ struct Search {
         const int32_t* const nodes_of_wave = wave.data();
         uint16_t* const left = unreached.data();
         int32_t* const to = next.data();
-        const int64_t neighbours[] = {-pitch, pitch, -1, 1};
         int64_t count = 0;
         for (int64_t n = 0; n < size; n++) {
             const int k = nodes_of_wave[n] >> SHIFT;
@@ -225,7 +226,7 @@ struct Search {
             const float from = k == 0 || k == K ? height[c] : several[entry[c]].height[k];
             const int32_t num_blind = k < K ? 0 : blind[c];
             const float limit = max_step + rise * float(num_blind);
-            for (const int64_t away : neighbours) {
+            for (const int64_t away : sides) {
                 const int64_t beside = c + away;
                 const uint16_t bits = left[beside];
                 if (bits & ~(1 | KNOWN)) {

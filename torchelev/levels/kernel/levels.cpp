@@ -101,15 +101,6 @@ struct MapUpdate : levels::Choice {
         }
     }
 
-    bool any_levels(int64_t p, int64_t number) const {
-        int32_t any = 0;
-        for (int64_t l = 0; l < u.L; l++) {
-            const float* support = u.support + (b * u.L + l) * cells + p;
-            for (int64_t n = 0; n < number; n++) any |= support[n] > 0;
-        }
-        return any;
-    }
-
     // What is known of the space over a row of cells.
     struct Space {
         const float *ground, *high, *low, *support;  // the ground, and the highest and lowest ray [m]; points of the ground

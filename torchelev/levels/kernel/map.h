@@ -80,11 +80,16 @@ struct Map {
         forget_space(p);
     }
 
-    bool has_levels(int64_t p) const {
-        bool any = false;
-        for (int64_t l = 0; l < u.L; l++) any |= u.support[(b * u.L + l) * cells + p] > 0;
+    // Whether any of some places side by side in the ring has levels.
+    bool any_levels(int64_t p, int64_t number) const {
+        int32_t any = 0;
+        for (int64_t l = 0; l < u.L; l++) {
+            const float* support = u.support + (b * u.L + l) * cells + p;
+            for (int64_t n = 0; n < number; n++) any |= support[n] > 0;
+        }
         return any;
     }
+    bool has_levels(int64_t p) const { return any_levels(p, 1); }
 
     // Whether rays passed below a surface at height `top` over a cell: it hangs free.
     bool floats(int64_t c, float top) const {

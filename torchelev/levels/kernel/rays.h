@@ -30,6 +30,8 @@ struct SightGrid {
         return std::min(bin, azimuths - 1);
     }
     int32_t range_bin(float rho) const { return std::min(int32_t(rho / resolution), ranges - 2); }
+    // The row of the rays that end more than a cell behind a place.
+    int32_t row_behind(float d) const { return std::min(int32_t(d / resolution + MARGIN), ranges - 1); }
     int32_t elevation_bin(float rho, float dz) const {
         const float fraction = 0.5f + 0.5f * (dz / std::max(rho + std::fabs(dz), 1e-12f));
         return std::min(int32_t(fraction * float(elevations)), elevations - 1);
@@ -97,8 +99,7 @@ struct Sight {
     float raise_free_top(float top, float floor, float x, float y, float min_gap, const SightGrid& size) const {
         const float dx = x - origin[0], dy = y - origin[1], d = horizontal(dx, dy);
         const int32_t azimuth = size.azimuth_bin(dx, dy);
-        const int32_t row = std::min(int32_t(d / size.resolution + MARGIN), size.ranges - 1);
-        const float highest = origin[2] + slopes[int64_t(row) * size.azimuths + azimuth].highest * d;
+        const float highest = origin[2] + slopes[int64_t(size.row_behind(d)) * size.azimuths + azimuth].highest * d;
         if (!(highest > std::max(top, floor) + RISE * size.resolution)) return top;
         const float begin = std::max(top, floor + 0.5f * min_gap), behind = d + MARGIN * size.resolution;
         const int32_t last = size.elevation_bin(d, std::max(begin, highest) - origin[2]);
@@ -149,8 +150,7 @@ struct Sights {
                 for (int64_t n = 0; n < number; n++) {
                     const float dy = y[first + n] - sight.origin[1];
                     d[n] = horizontal(dx, dy);
-                    const int32_t row = std::min(int32_t(d[n] / size.resolution + MARGIN), size.ranges - 1);
-                    place[n] = row * size.azimuths + size.azimuth_bin(dx, dy);
+                    place[n] = size.row_behind(d[n]) * size.azimuths + size.azimuth_bin(dx, dy);
                 }
                 for (int64_t n = 0; n < number; n++) {
                     const float up = sight.origin[2] + sight.slopes[place[n]].highest * d[n];
