@@ -16,6 +16,7 @@ from torchelev.app.mapping.map_options import map_options
 from torchelev.app.mapping.map_request import MapRequest
 from torchelev.app.option_groups import GroupedCommand, GroupedOption
 from torchelev.app.ros2_command import ros2_command
+from torchelev.app.site.commands import site_command
 from torchelev.app.user_error import plain_warnings, user_errors
 from torchelev.robot import RobotConfig
 
@@ -293,3 +294,4 @@ def check_command(bundle: Path, library: Path | None) -> None:
 
 
 main.add_command(ros2_command)
+main.add_command(site_command)

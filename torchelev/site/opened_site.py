@@ -139,6 +139,11 @@ class OpenedSite(ReadableSite):
             merges = stored.get("keyframe_merges")
             self._keyframes = None if merges is None else KeyframeLog(self._store, merges)
 
+    @property
+    def version(self) -> str:
+        """The id of the version that the site shows: of its last merge, or of the one that it was opened at."""
+        return str(self._num_commits)
+
     # Writing --------------------------------------------------------------------------------------------------------
 
     def _require_writable(self) -> None:

@@ -1,0 +1,1 @@
+"""`torchelev site`: what the command line does with a site map."""
