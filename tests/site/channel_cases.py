@@ -1,13 +1,12 @@
 """A site that keeps channels of every kind of fusion, and robots that see one of its cells."""
 
-import json
-
 import numpy as np
 import torch
 
 from tests.helpers import pose, small_map
 from torchelev import ChannelConfig
 from torchelev.site.channels import SiteChannels
+from torchelev.site.storage.engines import open_store
 from torchelev.site.storage.store import TileStore
 from torchelev.site.tiles import LAYERS
 
@@ -52,7 +51,7 @@ def stored(site, layer):
 
 
 def stored_layers(path):
-    return json.loads((path / "zarr.json").read_text())["attributes"]["layers"]
+    return list(open_store(path, read_only=True).layers)
 
 
 def folder_without(path):

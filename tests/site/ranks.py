@@ -16,6 +16,7 @@ from tests.helpers import small_map
 from tests.site.helpers import fill, live
 from torchelev.site import LostRankError, SiteConfig, SiteMap
 from torchelev.site.reading import LAYERS
+from torchelev.site.storage.versioned import store
 
 NUM_ROBOTS = 11
 CORNERS = [(0, 0), (12, -9), (20, 25), (-30, 6), (8, 20), (45, 30), (160, 0), (170, 8), (-8, -20), (25, 5), (-99, 70)]
@@ -131,16 +132,12 @@ def one_robot(rank, step=0):
 
 def races(rank, path, slow):
     """Merge the same robots twice; one rank is slow where another could overtake it."""
-    from torchelev.site.storage import store
-
     site, seen, emap = open_site(path), [], one_robot(rank)
-    read, finish = site._tiles.read, store.finish
+    read, commit = site._tiles.read, store.commit
     if slow == "reading" and rank == 1:
         site._tiles.read = lambda tiles: (time.sleep(0.3), site._tiles.forget(), read(tiles))[2]
     if slow == "writing" and rank == 0:
-        rename = os.rename
-        os.rename = lambda *paths: (time.sleep(0.3), rename(*paths))
-        store.finish = lambda path: (time.sleep(0.1), finish(path))[1]
+        store.commit = lambda *args: (time.sleep(0.3), commit(*args), time.sleep(0.1))[1]
     for _ in range(3):
         fill(emap, [(10 * rank, 0)], lambda x, y: 0.1 * x)
         emap.state.elapsed.add_(10**9)
@@ -178,7 +175,7 @@ def _end(how):
         time.sleep(3.0)
         os._exit(1)
     if how == "before_commit":
-        os.rename = lambda *paths: os.kill(os.getpid(), signal.SIGKILL)
+        store.commit = lambda *args: os.kill(os.getpid(), signal.SIGKILL)
 
 
 def misuse(rank, path, other):
@@ -221,14 +218,16 @@ def _error_of(call):
 
 
 def _with_full_disk(merge):
-    def fail(*paths):
-        raise OSError(28, "No space left on device")
+    def fail(*args):
+        import icechunk
 
-    rename, os.rename = os.rename, fail
+        raise icechunk.IcechunkError("object store error: No space left on device")
+
+    commit, store.commit = store.commit, fail
     try:
         merge()
     finally:
-        os.rename = rename
+        store.commit = commit
 
 
 def _unreadable(site, merge, rank):

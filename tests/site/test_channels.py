@@ -197,7 +197,7 @@ def test_on_disk_they_go_on(tmp_path):
 @pytest.mark.slow(1)
 def test_a_site_of_before_channels_opens(tmp_path):
     emap, path = small_map(channels=CHANNELS), tmp_path / "site"
-    with SiteMap(resolution=0.1, path=path) as site:
+    with SiteMap(resolution=0.1, path=path, engine="files") as site:
         look(emap, {"heat": torch.ones(1, 1, 1)})
         site.merge(emap, align=False)
     header = json.loads((path / "zarr.json").read_text())

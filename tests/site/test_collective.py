@@ -104,7 +104,7 @@ EXPECTED = {
     "tilt": "tilt: must be the same on all ranks, got False on rank 0 and True on rank 1",
     "given": "time: must be the same on all ranks, got not given on rank 0 and given on rank 1",
     "call": "call: must be the same on all ranks, got SiteMap on rank 0 and merge on rank 1",
-    "disk": "cannot be written (No space left on device); all that was stored before is unchanged",
+    "disk": "cannot be used (the disk is full); all that was stored before is unchanged",
     "reading": "rank 1: tile (0, 0): must be readable",
 }
 

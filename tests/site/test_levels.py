@@ -1,7 +1,6 @@
 """Sites with levels: a bridge that one robot saw from its deck and another one from the road below."""
 
 import copy
-import json
 import re
 
 import numpy as np
@@ -14,6 +13,7 @@ from torchelev import LevelsConfig
 from torchelev.io.export import load_npz
 from torchelev.sim.exact import covered_scenes
 from torchelev.site import SiteMap
+from torchelev.site.storage.engines import open_store
 
 BRIDGE, DECK, THICKNESS = covered_scenes.bridge(), 12 * covered_scenes.RISE, 0.25
 MIDDLE, BESIDE = (0.05, 0.05), (0.05, 1.55)  # [m] on the bridge, and on the road next to it
@@ -299,8 +299,8 @@ def test_on_disk_and_in_files(maps, tmp_path):
 
 def test_a_site_without_levels_has_none_on_disk(maps, tmp_path):
     SiteMap(resolution=0.1, path=tmp_path / "site").merge(maps[0])
-    attributes = json.loads((tmp_path / "site" / "zarr.json").read_text())["attributes"]
-    assert len(attributes["layers"]) == 7 and "levels" not in attributes
+    store = open_store(tmp_path / "site", read_only=True)
+    assert len(store.layers) == 7 and "levels" not in store.attributes
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,8 @@ from torchelev.site.shared.collective import shared_transaction
 from torchelev.site.shared.ranks import Ranks
 from torchelev.site.site_config import SiteConfig
 from torchelev.site.site_levels import SiteLevels
+from torchelev.site.storage.engines import open_store
+from torchelev.site.storage.interface import Note
 from torchelev.site.tiles import LAYERS, Tiles
 
 if TYPE_CHECKING:
@@ -43,29 +45,30 @@ class OpenedSite(ReadableSite):
     def open(
         cls,
         path: str | Path,
+        version: str | None = None,
         *,
         read_only: bool = False,
         cfg: SiteConfig | None = None,
         device: torch.device | str = "cpu",
     ) -> Self:
-        """Open a site that is on disk.
+        """Open a site that is on disk or in an object store.
 
         Args:
-            path: its folder.
-            read_only: read beside a process that writes; `refresh` shows what it has written since.
+            path: its folder, or s3://bucket/prefix.
+            version: id or tag of the version to show, which is read-only and stays as it is; None: the newest.
+            read_only: read beside processes that write; `refresh` shows what they have written since.
             cfg: how windows are aligned and fused.
             device: that fuses.
 
         Raises:
             FileNotFoundError: there is nothing; ``SiteMap(resolution=..., path=...)`` makes a site.
-            ValueError: it is not a site, is damaged, or has a newer version.
-            OSError: another process writes to it.
+            KeyError: there is no such version.
+            ValueError: it is not a site, is damaged, or has a newer format.
+            OSError: it cannot be reached or read, or another process writes to a site of files.
         """
-        from torchelev.site.storage.store import TileStore
-
         site = cls.__new__(cls)
         site._ranks = Ranks(None)
-        site._store = TileStore.open(path, read_only=read_only)
+        site._store = open_store(path, read_only=read_only, version=version)
         site.resolution = float(site._store.attributes["resolution"])
         site.cfg = checks.given_or_default(SiteConfig, cfg)
         site._keyframes = None
@@ -83,6 +86,7 @@ class OpenedSite(ReadableSite):
         self._id, self._rate = uuid.uuid4().hex, self.cfg.variance_rate
         self._epoch = self._time = self._opened = 0.0  # the last two count from the first
         self._num_commits, self._interrupted = 0, None
+        self._rollbacks: list[list[int]] = []
         self._read_attributes()
 
     def _check_kept(self, wanted: bool, channels: SiteChannels, levels: SiteLevels) -> None:
@@ -127,22 +131,18 @@ class OpenedSite(ReadableSite):
         own["num_commits"] = self._num_commits + 1
         merges = None if self._keyframes is None else self._keyframes.num_merges + new_merges
         own["channels"] = self._tiles.channels.attributes
-        own |= self._tiles.levels.attributes
+        own |= self._tiles.levels.attributes | ({"rollbacks": self._rollbacks} if self._rollbacks else {})
         return own | {"variance_rate": self._rate, "keyframe_merges": merges}
 
     def _read_attributes(self) -> None:
-        if self._store is not None and "id" in self._store.attributes:
-            stored = self._store.attributes
-            self._id, self._epoch, self._time = stored["id"], stored["epoch"], stored["time"]
+        stored = {} if self._store is None else self._store.attributes
+        self._id, self._rollbacks = stored.get("id", self._id), stored.get("rollbacks", [])
+        if "num_commits" in stored:  # it has been merged into
+            self._epoch, self._time = stored["epoch"], stored["time"]
             self._opened, self._num_commits = self._time, stored["num_commits"]
             self._rate = stored["variance_rate"] if self.cfg.variance_rate is None else self.cfg.variance_rate
             merges = stored.get("keyframe_merges")
             self._keyframes = None if merges is None else KeyframeLog(self._store, merges)
-
-    @property
-    def version(self) -> str:
-        """The id of the version that the site shows: of its last merge, or of the one that it was opened at."""
-        return str(self._num_commits)
 
     # Writing --------------------------------------------------------------------------------------------------------
 
@@ -154,23 +154,33 @@ class OpenedSite(ReadableSite):
             require(not is_reader, "site", "must be open for writing", "a read-only site", "open it without read_only")
 
     def _write(
-        self, parts: Iterable[Merged], time: float, size: int, arrays: Arrays | None = None, merges: int = 0
+        self,
+        parts: Iterable[Merged],
+        time: float,
+        size: int,
+        arrays: Arrays | None = None,
+        merges: int = 0,
+        note: Note | None = None,
     ) -> Int[Tensor, "B"]:
         """Write tiles and arrays, on disk first; return the sum of the contradictions."""
         contradictions = torch.zeros(size, dtype=torch.int64, device=self._tiles.device)
         attributes = self._attributes(time, merges)
+        before = None if self._store is None else self._store.version
         try:
-            with shared_transaction(self._ranks, self._store, attributes, arrays) as write:
+            with shared_transaction(self._ranks, self._store, attributes, arrays, note) as write:
                 for part in parts:
                     write(part.tiles, part.values.transpose(0, 1).cpu().numpy())
                     self._tiles.write(part.tiles, part.values)
                     contradictions += part.contradictions
         except BaseException as error:
             self._tiles.forget()
-            if self._store is None or self._store.attributes.get("num_commits") != attributes["num_commits"]:
+            if self._store is None or self._store.version == before:
                 raise
             self._interrupted = error  # after the commit: raised once memory has followed
-        self._time, self._num_commits = time, attributes["num_commits"]
+        stored = attributes if self._store is None or self._ranks.size > 1 else self._store.attributes
+        if stored["num_commits"] != attributes["num_commits"]:  # on top of another writer's tiles
+            self._tiles.forget()
+        self._time, self._num_commits = stored["time"], stored["num_commits"]
         return contradictions
 
     def _raise_interrupted(self) -> None:

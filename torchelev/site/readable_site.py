@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
     from typing_extensions import Self
 
-    from torchelev.site.storage.store import TileStore
+    from torchelev.site.storage.interface import SiteStore
 
 
 class ReadableSite:
@@ -33,7 +33,7 @@ class ReadableSite:
 
     resolution: float
     _tiles: Tiles
-    _store: TileStore | None
+    _store: SiteStore | None
     _rate: float | None
     _epoch: float
     _time: float

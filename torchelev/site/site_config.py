@@ -23,11 +23,13 @@ class SiteConfig:
     min_overlap: int = 20  #: such cells that two windows, or a window and the site, must share to be compared
     max_compared: int = 32768  #: cells of all windows that are compared; more are thinned on the lattice
     cache_tiles: int = 256  #: tiles of a site on disk that stay in memory: 29 MB
+    #: once in so many merges, all versions but so many of the newest and those with tags are dropped
+    keep_versions: int = 100
 
     def __post_init__(self) -> None:
         names = ("gate", "max_gate_std", "max_newer_ratio", "max_slope", "max_std")
         require_positive(**{f"cfg.{name}": getattr(self, name) for name in names})
-        for name in ("min_overlap", "max_compared", "cache_tiles"):
+        for name in ("min_overlap", "max_compared", "cache_tiles", "keep_versions"):
             require_count(f"cfg.{name}", getattr(self, name), "see its default")
         rate = self.variance_rate
         require(rate is None or rate >= 0, "cfg.variance_rate", "must not be negative", rate, "give m^2/s")

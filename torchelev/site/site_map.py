@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
@@ -38,13 +37,15 @@ from torchelev.site.initialize_from_site import add_filled, center_on, fill, mov
 from torchelev.site.keyframes.keyframe_log import KeyframeLog, arrays_of, changed_arrays
 from torchelev.site.keyframes.keyframes import Keyframes, Recorded, correct, record
 from torchelev.site.keyframes.rebuild import merge_recorded, rebuild_moved
-from torchelev.site.opened_site import OpenedSite
 from torchelev.site.shared.collective import gather_windows, open_shared
 from torchelev.site.shared.ranks import Ranks
 from torchelev.site.site_config import SiteConfig
 from torchelev.site.site_levels import SiteLevels
+from torchelev.site.storage.interface import Note, Overtaken
+from torchelev.site.storage.versioned.repository import UncertainCommitError
 from torchelev.site.tiles import LAYERS, locate
 from torchelev.site.times import check_time, continue_time, warn_of_other_clock
+from torchelev.site.versioned_site import VersionedSite, contributions
 from torchelev.stages.initialize import Remembered
 from torchelev.state import MapState, map_layers
 
@@ -53,12 +54,10 @@ if TYPE_CHECKING:
     from torch.distributed import ProcessGroup
 
     from torchelev.levels.config import LevelsConfig
-
-# By map and site: a map's contribution. Of all sites of a process, so that a site may be closed and opened again.
-_contributions: WeakKeyDictionary[ElevationMap, dict[str, Contribution]] = WeakKeyDictionary()
+    from torchelev.site.storage.engines import Engine
 
 
-class SiteMap(OpenedSite):
+class SiteMap(VersionedSite):
     """A world map that grows: the windows of many robots, in one frame.
 
     ```python
@@ -70,7 +69,9 @@ class SiteMap(OpenedSite):
     ```
 
     It is made of square tiles, of which a merge touches those below the windows alone. On disk, a merge is written
-    completely or not at all, and memory does not grow with the area.
+    completely or not at all, and memory does not grow with the area. Each merge makes a version: see `versions`, `tag`,
+    `rollback` and `compact`. Several processes may write to one site: those of a folder take turns; in an object store,
+    the later one of two that meet merges on top of the earlier one.
 
     With a `group`, all its ranks hold one site, and `merge` takes the robots of all of them, in the order of the ranks:
     call it on all ranks, which wait for each other. Reading is up to each rank. On disk, rank 0 writes, and the others
@@ -78,8 +79,9 @@ class SiteMap(OpenedSite):
 
     Args:
         resolution: [m] of the cells, as of the maps that are merged.
-        path: the folder to keep it in, which needs ``torchelev[site]``. A site that is there already is continued.
-            None: in memory, 28 bytes for each cell of a tile.
+        path: the folder or object store, s3://bucket/prefix, to keep it in, which needs ``torchelev[site]``. A site
+            that is there already is continued. None: in memory, 28 bytes for each cell of a tile. What S3 needs to know
+            comes from the environment: AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_REGION, AWS_ENDPOINT_URL.
         cfg: how windows are aligned and fused.
         device: that fuses; maps may lie on another one.
         group: processes that share the site, such as `torch.distributed.group.WORLD`; None: this one alone. Give
@@ -91,6 +93,9 @@ class SiteMap(OpenedSite):
         channels: keep these channels of the maps that are merged, as of `ElevationMapConfig(channels=...)`: 4 bytes for
             each cell and component, and 8 for the weight and since when it counts ("maximum": 4). Settings of ageing
             are of no use. Holds from the first merge on; a site on disk that has channels continues to keep them.
+        engine: of a new site: "icechunk" keeps versions and takes several writers; "files" neither, but needs a 45th of
+            the space after a hundred merges, and reads four times as fast. None: "icechunk" where it is installed, as
+            with ``torchelev[site]`` on Python 3.11 and later, and "files" otherwise.
 
     Attributes:
         resolution: [m].
@@ -101,7 +106,8 @@ class SiteMap(OpenedSite):
             group is not initialised, or its ranks open the site differently; or `keyframes` are to be kept by a group,
             or by a site that was begun without; or `channels` or `levels` are to be kept beside keyframes or by a
             group, or are others than those of the site at `path`.
-        ModuleNotFoundError: tensorstore is missing.
+        OSError: the folder or object store cannot be reached or written.
+        ModuleNotFoundError: the engine is missing.
     """
 
     def __init__(
@@ -115,11 +121,14 @@ class SiteMap(OpenedSite):
         keyframes: bool = False,
         channels: Mapping[str, Any] | None = None,
         levels: LevelsConfig | None = None,
+        engine: Engine | None = None,
     ) -> None:
         self._ranks, wanted = Ranks(group), (SiteChannels(channels, LAYERS), SiteLevels(levels))
         wanted[1].require_alone(self._ranks.size == 1 and not keyframes)
         self._ranks.exchange("SiteMap", lambda: {"same": self._set_up(resolution, path, cfg)})
-        self._store = None if path is None else open_shared(self._ranks, "SiteMap", path, self.resolution, *wanted)
+        self._store = (
+            None if path is None else open_shared(self._ranks, "SiteMap", path, self.resolution, *wanted, engine)
+        )
         self._keyframes = KeyframeLog(self._store) if keyframes else None
         self._begin(device, *wanted)
         self._check_kept(keyframes, *wanted)
@@ -169,6 +178,24 @@ class SiteMap(OpenedSite):
             OSError: the disk is full; the site is as it was before.
             LostRankError: of a group, another rank has ended; the site is as it was before.
         """
+        with self._turn():
+            while True:
+                try:
+                    report = self._merge(emap, time, align, tilt, T_map_base)
+                except Overtaken:
+                    if self._ranks.size > 1:
+                        raise OSError("site: must have no other writer beside a group, got one: end it") from None
+                    self.refresh()
+                else:
+                    break
+            self._compact_in_time()
+        self._raise_interrupted()
+        return report
+
+    def _merge(
+        self, emap: ElevationMap, time: float | None, align: bool, tilt: bool, T_map_base: Tensor | None
+    ) -> MergeReport:
+        """Merge into the version that the site shows; Overtaken if it is no longer the newest one."""
         plans = self._ranks.exchange("merge", lambda: self._plan(emap, time, align, tilt))
         if self._keyframes is not None:
             T_map_base = _require_poses(emap, T_map_base)
@@ -196,15 +223,20 @@ class SiteMap(OpenedSite):
         stack = None if surfaces is None else surfaces.now
         contribution = snapshot(emap, windows, alignment, state.elapsed, keyframes, shares, stack)
         if self._store is None and new is None:  # interrupted, memory may hold a part, which must not count twice
-            _contributions.setdefault(emap, {})[self._id] = contribution
-        contradictions = self._fuse(all_windows, all_aligned, now, new, changes, surfaces)[own]
-        _contributions.setdefault(emap, {})[self._id] = contribution
-        self._raise_interrupted()
-        return MergeReport(*alignment, count(windows.is_new), contradictions)
+            self._keep(emap, contribution)
+        new_cells = count(windows.is_new)
+        note = describe_merge(len(all_windows.known.corner), int(count(all_windows.is_new).sum()))
+        try:
+            contradictions = self._fuse(all_windows, all_aligned, now, new, changes, surfaces, note)[own]
+        except UncertainCommitError as error:
+            self._in_doubt = error.commit, emap, contribution
+            raise
+        self._keep(emap, contribution)
+        return MergeReport(*alignment, new_cells, contradictions)
 
     def _recall_contribution(self, emap: ElevationMap) -> Contribution | None:
         """Return a map's contribution since its last reset; None: it has not merged since."""
-        contribution = _contributions.get(emap, {}).get(self._id)
+        contribution = contributions.get(emap, {}).get(self._id)
         if contribution is None:
             return None
         device = contribution.elapsed.device
@@ -241,6 +273,7 @@ class SiteMap(OpenedSite):
         self.require_resolution(emap)
         self._tiles.channels.require_fit(emap)
         self._require_writable()
+        self._require_not_taken_back(emap, contributions.get(emap, {}).get(self._id))
 
     def require_resolution(self, emap: ElevationMap) -> None:
         """Raise ValueError unless a map has the site's resolution."""
@@ -283,14 +316,15 @@ class SiteMap(OpenedSite):
         new: Recorded | None,
         changes: dict[str, Change],
         surfaces: SurfaceChange | None,
+        note: Note,
     ) -> Int[Tensor, "B"]:
         """Fuse windows, or their keyframes, into tiles; return each robot's contradictions."""
         rate, time = self._clock.rate, max(self._time, now)
         if self._keyframes is None or new is None:
             parts = merge_windows(self._tiles, windows, alignment, self.resolution, rate, self.cfg, changes, surfaces)
-            return self._write(parts, time, len(windows.known.corner))
+            return self._write(parts, time, len(windows.known.corner), note=note)
         parts = merge_recorded(self._tiles, self._keyframes.rows, new, self.resolution, rate, self.cfg)
-        contradictions = self._write(parts if self._store else list(parts), time, len(new.ids), arrays_of(new), 1)
+        contradictions = self._write(parts if self._store else list(parts), time, len(new.ids), arrays_of(new), 1, note)
         self._keyframes.append(new)
         return contradictions
 
@@ -324,16 +358,29 @@ class SiteMap(OpenedSite):
                 are not rigid (K, 4, 4). Nothing has changed then.
             OSError: the disk is full; the site is as it was before.
         """
-        log = self._require_keyframes()
+        self._require_keyframes()
         self._require_writable()
+        with self._turn():
+            while True:
+                try:
+                    self._move_keyframes(ids, T_map_base)
+                except Overtaken:
+                    self.refresh()
+                else:
+                    break
+        self._raise_interrupted()
+
+    def _move_keyframes(self, ids: Tensor, T_map_base: Tensor) -> None:
+        """Move keyframes of the version that the site shows; Overtaken if it is no longer the newest one."""
+        log = self._require_keyframes()
         after = correct(log.rows, ids, T_map_base)
         arrays = changed_arrays(log.rows, after)
         if arrays:
             parts = rebuild_moved(self._tiles, log, after, self.resolution, self._clock.rate, self.cfg)
             parts = (part._replace(contradictions=part.contradictions.sum()[None]) for part in parts)
-            self._write(parts if self._store else list(parts), self._time, 1, arrays)
+            note = Note(f"{len(ids)} keyframe{'s' * (len(ids) != 1)} moved")
+            self._write(parts if self._store else list(parts), self._time, 1, arrays, note=note)
             log.replace(after)
-            self._raise_interrupted()
 
     def _require_keyframes(self) -> KeyframeLog:
         hint = "make it with SiteMap(..., keyframes=True)"
@@ -358,7 +405,7 @@ class SiteMap(OpenedSite):
         filled = add_filled(contribution, state, after, self._clock.rate, chosen)
         if self._tiles.levels:
             filled = fill_levels(emap, state, after, self._tiles, filled, chosen, self._clock, self.resolution)
-        _contributions.setdefault(emap, {})[self._id] = filled
+        self._keep(emap, filled)
         return map_layers(lambda value: value.to(emap.device), after)
 
     def _read_chosen(self, state: MapState, chosen: Bool[Tensor, "B"]) -> Remembered:
@@ -367,6 +414,12 @@ class SiteMap(OpenedSite):
         areas = self.windows(state.corner[ids], size[0], size[1], Remembered._fields) if len(ids) else {}
         unknown = torch.full(state.elevation.shape, torch.nan, device=chosen.device)
         return Remembered(*(unknown.index_copy(0, ids, areas[n]) if areas else unknown for n in Remembered._fields))
+
+
+def describe_merge(num_robots: int, num_cells: int) -> Note:
+    """Return what the history says of a merge."""
+    robots = f"{num_robots} robot{'s' * (num_robots != 1)}"
+    return Note(f"{robots}, {num_cells:,} new cells", num_robots, num_cells)
 
 
 def _require_poses(emap: ElevationMap, T_map_base: Tensor | None) -> Tensor:

@@ -1,15 +1,11 @@
-"""Compare today's files of a site with Icechunk, which keeps each merge as a snapshot: time, disk, memory.
+"""Compare the two engines of a site: files, and Icechunk, which keeps each merge as a version. Time, disk, memory.
 
-    pip install icechunk zarr  # beside torchelev[site]
     python -m benchmarks.speed.site.site_engines  # benchmarks/results/site_engines.json, five minutes
     python -m benchmarks.speed.site.site_engines --merges 10 --out here  # quicker, rougher
 
 256 robots with windows of 64 x 64 cells, which overlap their neighbours by half, merge as in `site_merge`. Engines take
-turns, forwards and backwards, on the same windows and must end with the same cells; figures are medians.
-
-- today: `SiteMap(path=...)`.
-- icechunk: the same array, chunks and codecs in a repository of local files, written and read by zarr-python.
-- icechunk, bytes: chunks are encoded without zarr-python, so that what remains is Icechunk's own.
+turns, forwards and backwards, on the same windows and must end with the same cells; figures are medians. Icechunk drops
+no version until it is compacted.
 
 A commit alone, opening and reading concern the storage: all tiles of the site, read-only, files in the system's cache.
 Compacting keeps the newest snapshot. Memory is the largest of a process that merges, beyond one that merges in memory.
@@ -35,13 +31,13 @@ from benchmarks import RESULTS
 from benchmarks.speed.meter import in_new_process, peak_megabytes, progress
 from benchmarks.speed.site.site_windows import RESOLUTION, Windows, lattice
 from torchelev.app.results import markdown_table, write_json
-from torchelev.site import SiteMap
-from torchelev.site.storage.store import TileStore
+from torchelev.site import SiteConfig, SiteMap
+from torchelev.site.storage.engines import open_store
 
-ENGINES = ("today", "icechunk", "icechunk, bytes")
 SIZES_AT = (1, 10, 100)  # merges
 STEP = 4  # [cells] of a round
-LIMIT = 1.3  # today's times this is what a new engine may take
+ENGINES = ("files", "icechunk")
+LIMIT = 1.3  # figures of Icechunk that are so many times those of files are marked
 
 
 @dataclass(frozen=True)
@@ -60,20 +56,13 @@ def new_site(engine: str, folder: Path) -> SiteMap:
     """Return a site in an empty folder; or in memory."""
     if engine == "memory":
         return SiteMap(RESOLUTION)
-    if engine == "today":
-        return SiteMap(RESOLUTION, folder / engine)
-    from benchmarks.speed.site.icechunk_store import IcechunkSite
-
-    return IcechunkSite(folder / engine, raw=engine.endswith("bytes"))
+    cfg = SiteConfig(keep_versions=1_000_000)
+    return SiteMap(RESOLUTION, folder / engine, cfg=cfg, engine=engine)  # type: ignore[arg-type]
 
 
-def open_store(engine: str, folder: Path, *, read_only: bool = True) -> Any:
-    """Open what `new_site` has made."""
-    if engine == "today":
-        return TileStore.open(folder / engine, read_only=read_only)
-    from benchmarks.speed.site.icechunk_store import IcechunkStore
-
-    return IcechunkStore(folder / engine, read_only=read_only, raw=engine.endswith("bytes"))
+def open_engine(engine: str, folder: Path, *, read_only: bool = True) -> Any:
+    """Open the store of what `new_site` has made."""
+    return open_store(folder / engine, read_only=read_only)
 
 
 def in_turn(rounds: int) -> Iterator[str]:
@@ -132,8 +121,8 @@ def time_commits(times: Times, tiles: list[tuple[int, int]], values: np.ndarray,
     with tempfile.TemporaryDirectory() as name:
         for engine in ENGINES:
             new_site(engine, Path(name)).close()
-        stores = {engine: open_store(engine, Path(name), read_only=False) for engine in ENGINES}
-        attributes = {key: value for key, value in stores["today"].attributes.items() if value is not None}
+        stores = {engine: open_engine(engine, Path(name), read_only=False) for engine in ENGINES}
+        attributes = {key: value for key, value in stores["files"].attributes.items() if value is not None}
         for engine in in_turn(sizes.repeats):
             times.take(engine, "commit_ms", lambda store=stores[engine]: store.commit(tiles, values, attributes))  # type: ignore[misc]
         for store in stores.values():
@@ -144,10 +133,10 @@ def time_reading(folder: Path, times: Times, sizes: Sizes, after: str = "") -> t
     """Open the sites and read all of their tiles; return these, which must be the same."""
     results: dict[str, Any] = {}
     for engine in in_turn(sizes.repeats):
-        store = times.take(engine, f"open{after}_ms", lambda engine=engine: open_store(engine, folder))  # type: ignore[misc]
+        store = times.take(engine, f"open{after}_ms", lambda engine=engine: open_engine(engine, folder))  # type: ignore[misc]
         tiles = sorted(store.tiles)
         results[engine] = tiles, times.take(engine, f"read{after}_ms", lambda: store.read(tiles))  # noqa: B023
-    first = results["today"]
+    first = results["files"]
     for tiles, values in results.values():
         assert tiles == first[0] and np.array_equal(values, first[1], equal_nan=True)
     return first
@@ -158,9 +147,8 @@ def compact(folder: Path, times: Times) -> dict[str, dict[str, int]]:
     disk = {}
     for engine in ENGINES:
         files = sum(len(names) for _, _, names in os.walk(folder / engine))
-        with open_store(engine, folder, read_only=False) as store:
-            if engine != "today":
-                times.take(engine, "compact_ms", store.compact)
+        with open_engine(engine, folder, read_only=False) as store:
+            times.take(engine, "compact_ms", lambda: store.compact(1))
             disk[engine] = {"files": files, "bytes_compacted": store.num_bytes}
     return disk
 
@@ -198,7 +186,7 @@ def measure(merges: int, sizes: Sizes) -> list[dict[str, Any]]:
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """Tabulate the figures, and how many times today's the better one of Icechunk's is."""
+    """Tabulate the figures, and how many times those of files Icechunk's are."""
     names = {
         "first_ms": "first merge [ms]",
         "steady_ms": "steady merge [ms]",
@@ -214,18 +202,17 @@ def table(rows: list[dict[str, Any]]) -> str:
         "peak_mb": "memory [MB]",
     }
     lines = [_line(label, [row.get(name) for row in rows], name) for name, label in names.items()]
-    return markdown_table(["", *(row["engine"] for row in rows), "Icechunk / today"], lines)
+    return markdown_table(["", *(row["engine"] for row in rows), "Icechunk / files"], lines)
 
 
 def _line(label: str, values: list[float | None], name: str) -> list[str]:
     scale = 1e6 if name.startswith("bytes") else 1
     digits = 0 if name in ("files", "peak_mb") else 1
     shown = ["–" if value is None else f"{value / scale:,.{digits}f}" for value in values]
-    today, *others = values
-    known = [value for value in others if value is not None]
-    if not today or not known:
+    files, icechunk = values
+    if not files or icechunk is None:
         return [label, *shown, "–"]
-    ratio = min(known) / today
+    ratio = icechunk / files
     return [label, *shown, f"**{ratio:.2f}**" if ratio > LIMIT else f"{ratio:.2f}"]
 
 

@@ -77,6 +77,7 @@ class Contribution(NamedTuple):
     keyframe: Int[Tensor, "B"]  #: id of that merge's keyframe; -1: none was kept
     shares: Mapping[str, Share] = MappingProxyType({})  #: of the site's channels, by name
     stack: Stack | None = None  #: of a site with levels: all surfaces that they knew; None: the ground alone
+    number: int = 0  #: of the site's commit, from 1 on; 0: none yet
 
 
 def no_contribution(known: Known, num_resets: Int[Tensor, "B"]) -> Contribution:
@@ -140,7 +141,9 @@ def drop_reset(contribution: Contribution, num_resets: Int[Tensor, "B"], elapsed
     stack = contribution.stack
     if stack is not None:
         stack = stack._replace(is_known=stack.is_known & ~was_reset[:, None, None, None])
-    return Contribution(known, alignment, elapsed, num_resets.clone(), keyframe, contribution.shares, stack)
+    return contribution._replace(
+        known=known, alignment=alignment, elapsed=elapsed, num_resets=num_resets.clone(), keyframe=keyframe, stack=stack
+    )
 
 
 def _find_new(state: MapState, known: Known, contribution: Contribution | None) -> Bool[Tensor, "B H W"]:

@@ -13,7 +13,7 @@ from torchelev.site.keyframes.keyframes import LAYERS, Keyframes, Recorded, Rows
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from torchelev.site.storage.store import TileStore
+    from torchelev.site.storage.interface import SiteStore
 
 Arrays = dict[str, tuple["NDArray", Mapping[str, Any]]]
 # Rows that are stored as attributes, and their names there, which stored sites fix.
@@ -31,7 +31,7 @@ class KeyframeLog:
         num_merges: that are in the store.
     """
 
-    def __init__(self, store: TileStore | None, num_merges: int = 0) -> None:
+    def __init__(self, store: SiteStore | None, num_merges: int = 0) -> None:
         self._store, self.num_merges = store, num_merges
         self._rows = None if num_merges else no_rows()
         self._layers: list[Tensor] = []

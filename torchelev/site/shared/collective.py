@@ -19,6 +19,7 @@ rounding; on disk is what rank 0 has computed.
 from __future__ import annotations
 
 import math
+import uuid
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -32,22 +33,30 @@ from torchelev.site.fusion.windows import Windows
 from torchelev.site.shared.packing import Layout, pack, unpack
 from torchelev.site.shared.ranks import Ranks
 from torchelev.site.site_levels import SiteLevels
+from torchelev.site.storage.engines import create_store, exists, open_store
 from torchelev.site.tiles import LAYERS, TILE
 
 if TYPE_CHECKING:
-    from torchelev.site.storage.store import TileStore
+    from torchelev.site.storage.engines import Engine
+    from torchelev.site.storage.interface import Note, SiteStore
 
 
 def open_shared(
-    ranks: Ranks, call: str, path: str | Path, resolution: float, channels: SiteChannels, levels: SiteLevels
-) -> TileStore:
-    """Create or open a site's folder on rank 0 for writing, and then open it on the others, read-only."""
+    ranks: Ranks,
+    call: str,
+    path: str | Path,
+    resolution: float,
+    channels: SiteChannels,
+    levels: SiteLevels,
+    engine: Engine | None = None,
+) -> SiteStore:
+    """Create or open a site on rank 0 for writing, and then open it on the others, read-only."""
     store = None
     try:
         for turn in (True, False):
             with ranks.together(call):
                 if (ranks.rank == 0) == turn:
-                    store = _open(path, resolution, channels, levels, not turn)
+                    store = _open(path, resolution, channels, levels, not turn, engine)
     except BaseException:
         if store is not None:
             store.close()
@@ -57,19 +66,23 @@ def open_shared(
 
 
 def _open(
-    path: str | Path, resolution: float, channels: SiteChannels, levels: SiteLevels, read_only: bool
-) -> TileStore:
-    """Create a site's folder, or open one that is there, of the same resolution."""
-    from torchelev.site.storage.store import TileStore
-
-    path = Path(path)
-    exists = (path / "zarr.json").exists()
-    if not exists and not read_only:
-        attributes = {"resolution": resolution, "channels": channels.attributes} | levels.attributes
+    path: str | Path,
+    resolution: float,
+    channels: SiteChannels,
+    levels: SiteLevels,
+    read_only: bool,
+    engine: Engine | None,
+) -> SiteStore:
+    """Create a site, or open one that is there, of the same resolution."""
+    is_there = exists(path)
+    if not is_there and not read_only:
+        attributes = {"id": uuid.uuid4().hex, "resolution": resolution, "channels": channels.attributes}
         layers = (*LAYERS, *channels.stored, *levels.stored)
-        return TileStore.create(path, layers=layers, tile_size=TILE, attributes=attributes)
-    require(exists, "path", "must be a folder that all ranks see", path, "mount it on every machine", OSError)
-    store = TileStore.open(path, read_only=read_only)
+        return create_store(
+            path, layers=layers, tile_size=TILE, attributes=attributes | levels.attributes, engine=engine
+        )
+    require(is_there, "path", "must be a folder that all ranks see", path, "mount it on every machine", OSError)
+    store = open_store(path, read_only=read_only)
     actual, hint = float(store.attributes["resolution"]), "give that resolution, or another path"
     is_same = math.isclose(actual, resolution, rel_tol=1e-9)
     if not is_same:
@@ -100,7 +113,11 @@ def gather_windows(ranks: Ranks, windows: Windows, plans: list[dict[str, Any]]) 
 
 @contextmanager
 def shared_transaction(
-    ranks: Ranks, store: TileStore | None, attributes: Mapping[str, Any], arrays: Mapping[str, Any] | None = None
+    ranks: Ranks,
+    store: SiteStore | None,
+    attributes: Mapping[str, Any],
+    arrays: Mapping[str, Any] | None = None,
+    note: Note | None = None,
 ) -> Iterator[Callable[..., None]]:
     """Yield a function that writes tiles, which rank 0 commits once all ranks are at the end, if there is a store.
 
@@ -109,25 +126,18 @@ def shared_transaction(
     if store is None:
         yield _write_nothing
         return
-    with ranks.together("merge"):
-        with store.transaction(attributes, arrays) if ranks.rank == 0 else nullcontext(_write_nothing) as write:
+    with ranks.together("merge", lambda: {"version": store.version}) as stored:
+        with store.transaction(attributes, arrays, note) if ranks.rank == 0 else nullcontext(_write_nothing) as write:
             with ranks.together("merge"):
                 yield write
     if ranks.rank:
         store.refresh()
-        _require_current(store, attributes)
+        rule, hint = (
+            f"must show what rank 0 has stored, {stored[0]['version']}",
+            "give all ranks one folder, mounted without a cache",
+        )
+        require(store.version == stored[0]["version"], str(store.path), rule, store.version, hint, OSError)
 
 
 def _write_nothing(*args: object) -> None:
     pass
-
-
-def _require_current(store: TileStore, attributes: Mapping[str, Any]) -> None:
-    """Raise OSError unless a store shows what rank 0 has just committed."""
-    names = "id", "time"
-    actual, expected = ([values.get(name) for name in names] for values in (store.attributes, attributes))
-    rule, hint = (
-        f"must show what rank 0 has committed, {expected}",
-        "give all ranks one folder, mounted without a cache",
-    )
-    require(actual == expected, str(store.path), rule, actual, hint, OSError)

@@ -74,19 +74,29 @@ class Ranks:
         return values
 
     @contextmanager
-    def together(self, call: str) -> Iterator[None]:
-        """Wait at the end of the block for all ranks; if it raises on one rank, all raise."""
+    def together(self, call: str, make: Callable[[], dict[str, Any]] = dict) -> Iterator[list[dict[str, Any]]]:
+        """Wait at the end of the block for all ranks; if it raises on one rank, all raise.
+
+        Args:
+            call: as of `exchange`.
+            make: as of `exchange`, called at the end.
+
+        Yields:
+            A list, which holds what `make` returns on each rank once the block has ended.
+        """
+        values: list[dict[str, Any]] = []
         if self.size == 1:
-            yield
+            yield values
+            values.append(make())
             return
         failure = None
         try:
-            yield
+            yield values
         except LostRankError:
             raise
         except Exception as error:
             failure = error
-        self.exchange(call, lambda: _raise(failure))
+        values += self.exchange(call, lambda: _raise(failure) or make())
 
     def _exchange(self, call: str, values: dict[str, Any]) -> list[dict[str, Any]]:
         encoded = json.dumps(values).encode()

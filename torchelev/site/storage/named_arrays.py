@@ -26,7 +26,7 @@ from torchelev.site.storage.zarr_files import (
     write_metadata,
 )
 
-_NAME = re.compile(r"[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*")
+NAME = re.compile(r"[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*")
 _CHUNKS = "c"  # folder of an array's chunks
 
 
@@ -37,7 +37,7 @@ def check_names(path: Path, names: list[str]) -> None:
     """
     for name in names:
         parts = name.split("/")
-        is_name = _NAME.fullmatch(name) and _CHUNKS not in parts and parts[0] != CELLS
+        is_name = NAME.fullmatch(name) and _CHUNKS not in parts and parts[0] != CELLS
         rule = f"must be named by letters, digits, _ and -, not {_CHUNKS} or {CELLS}"
         require(bool(is_name), "arrays", rule, repr(name), 'name them "keyframes/0001", say')
     groups = {"/".join(name.split("/")[:depth]): name for name in names for depth in range(1, name.count("/") + 1)}
@@ -90,7 +90,7 @@ def list_arrays(path: Path) -> list[str]:
 
 
 def _read_metadata(path: Path, name: str) -> dict[str, Any]:
-    require(bool(_NAME.fullmatch(name)), "name", "must be that of an array", repr(name), "see array_names", KeyError)
+    require(bool(NAME.fullmatch(name)), "name", "must be that of an array", repr(name), "see array_names", KeyError)
     try:
         metadata = read_newest(path, lambda folder: read_metadata(folder / name / METADATA))
     except FileNotFoundError:

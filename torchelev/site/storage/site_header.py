@@ -7,7 +7,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
 from torchelev.errors import require, require_count
+from torchelev.site.storage.interface import Tile
 from torchelev.site.storage.transaction import COMMITTED, LOCK, STAGED, read_newest, stage
 from torchelev.site.storage.zarr_files import (
     METADATA,
@@ -46,6 +50,14 @@ class Header(NamedTuple):
         """Return the folder's metadata."""
         own = {"format": FORMAT, "version": VERSION, "layers": list(self.layers), "tile_size": self.tile_size}
         return group_metadata({**own, "origin": self.origin, "rule": _RULE, **self.attributes})
+
+    def check_tiles(self, pairs: list[Tile], values: ArrayLike) -> tuple[list[Tile], NDArray[np.float32]]:
+        """Return tiles and their (n, L, T, T) values; ValueError if they break a rule."""
+        cells = np.ascontiguousarray(values, np.float32)
+        require(len(set(pairs)) == len(pairs), "tiles", "must differ", f"{len(pairs)} with repeats", "give each once")
+        shape = (len(pairs), *self.tile_shape)
+        require(cells.shape == shape, "values", f"expected (n, L, T, T) = {shape}", cells.shape, "stack the tiles")
+        return pairs, cells
 
     def with_attributes(self, attributes: Mapping[str, Any]) -> Header:
         """Return a header with other attributes of the caller; ValueError if the header has one of their names."""
@@ -97,8 +109,7 @@ def read_header(path: Path) -> Header:
     require(path.is_dir(), str(path), "must be a folder", "a file", hint)
     require(is_site(path), str(path), "must be a site", f"a folder without {METADATA}", hint)
     attributes = read_newest(path, lambda folder: read_metadata(folder / METADATA))["attributes"]
-    _require_readable(path, attributes)
-    return _parse(path / METADATA, attributes)
+    return parse_header(path, attributes)
 
 
 def read_cells_metadata(path: Path, header: Header) -> dict[str, Any]:
@@ -115,17 +126,15 @@ def read_cells_metadata(path: Path, header: Header) -> dict[str, Any]:
     return metadata
 
 
-def _require_readable(path: Path, attributes: dict[str, Any]) -> None:
+def parse_header(path: Path | str, attributes: dict[str, Any]) -> Header:
+    """Return the header that a group's attributes hold; ValueError as of `read_header`."""
     actual = f"Zarr of another format: {attributes.get('format', 'unnamed')}"
     require(attributes.get("format") == FORMAT, str(path), "must be a site", actual, "read it with zarr")
     version = attributes.get("version")
     is_known = isinstance(version, int) and 1 <= version <= VERSION
     require(is_known, str(path), f"must be of format version 1 to {VERSION}", version, "read it with a newer torchelev")
-
-
-def _parse(file: Path, attributes: dict[str, Any]) -> Header:
     try:
         own = new_header(tuple(attributes["layers"]), attributes["tile_size"], {})
     except (KeyError, TypeError, ValueError) as error:
-        raise damaged(file, error) from error
+        raise damaged(f"{path}/{METADATA}", error) from error
     return own._replace(attributes={name: value for name, value in attributes.items() if name not in _OWN})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from datetime import datetime, timezone
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -15,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from torchelev.errors import require
 from torchelev.site.storage import named_arrays
+from torchelev.site.storage.interface import Note, Version
 from torchelev.site.storage.site_header import Header, make_site, new_header, read_header, require_empty
 from torchelev.site.storage.tile_files import Tile, TileFiles, as_tiles
 from torchelev.site.storage.transaction import CommitError, clean, finish, lock_folder, stage
@@ -159,21 +161,28 @@ class TileStore:
             ValueError: an argument breaks its rule, or the store is open read-only or closed.
             CommitError: the disk is full or cannot be written. All that was stored before is unchanged.
         """
-        pairs, cells = self._check(tiles, values)
+        pairs, cells = self._header.check_tiles(as_tiles(tiles), values)
         with self.transaction(attributes, arrays) as write:
             write(pairs, cells)
+
+    @contextmanager
+    def turn(self) -> Iterator[bool]:
+        """Do nothing: no one else writes while this store is open for writing."""
+        yield False
 
     @contextmanager
     def transaction(
         self,
         attributes: Mapping[str, Any],
         arrays: Mapping[str, tuple[NDArray, Mapping[str, Any]]] | None = None,
+        note: Note | None = None,
     ) -> Iterator[Callable[[Sequence[Tile] | NDArray, ArrayLike], None]]:
         """Commit tiles that come some at a time, all together when the block ends, or none if it raises.
 
         Args:
             attributes: as for `commit`.
             arrays: as for `commit`.
+            note: of no use here: there is no history.
 
         Yields:
             A function of tiles and values, as for `commit`. A tile may come once; the values must not change until the
@@ -192,7 +201,7 @@ class TileStore:
             with stage(self.path) as folder:
 
                 def write(tiles: Sequence[Tile] | NDArray, values: ArrayLike) -> None:
-                    pairs, cells = self._check(tiles, values)
+                    pairs, cells = self._header.check_tiles(as_tiles(tiles), values)
                     writes.extend(self._files.stage(pairs, cells))
                     written.update(pairs)
 
@@ -211,6 +220,37 @@ class TileStore:
     def is_read_only(self) -> bool:
         """Whether it is open read-only, or closed."""
         return self._lock is None
+
+    @property
+    def version(self) -> str:
+        """The number of the last commit, as this store keeps no other."""
+        return str(self._header.attributes.get("num_commits", 0))
+
+    def versions(self) -> list[Version]:
+        """Return the one version that there is."""
+        time = datetime.fromtimestamp((self.path / METADATA).stat().st_mtime, timezone.utc)
+        return [Version(self.version, time, "a site of files, which keep no history", (), 0, 0)]
+
+    def tag(self, name: str, version: str) -> None:
+        """Raise ValueError: files keep no versions."""
+        self._require_versions("tag")
+
+    def rollback(self, version: str) -> str:
+        """Raise ValueError: files keep no versions."""
+        return self._require_versions("rollback")
+
+    def compact(self, keep: int) -> int:
+        """Return 0: files keep no history."""
+        return 0
+
+    def holds(self, commit: str) -> bool:
+        """Return False: no commit of files ends in doubt."""
+        return False
+
+    def _require_versions(self, call: str) -> str:
+        hint = f"torchelev site convert {self.path} NEW"
+        require(False, call, "must be of a site with versions", "a site of files", hint)
+        return ""
 
     def read_array(self, name: str) -> tuple[NDArray, dict[str, Any]]:
         """Read an array and its attributes as of the last commit; KeyError if there is none of this name."""
@@ -232,14 +272,6 @@ class TileStore:
 
     def __exit__(self, *error: object) -> None:
         self.close()
-
-    def _check(self, tiles: Sequence[Tile] | NDArray, values: ArrayLike) -> tuple[list[Tile], NDArray[np.float32]]:
-        """Return the tiles and their values; ValueError if they break a rule."""
-        pairs, cells = as_tiles(tiles), np.ascontiguousarray(values, np.float32)
-        require(len(set(pairs)) == len(pairs), "tiles", "must differ", f"{len(pairs)} with repeats", "give each once")
-        shape = (len(pairs), *self._header.tile_shape)
-        require(cells.shape == shape, "values", f"expected (n, L, T, T) = {shape}", cells.shape, "stack the tiles")
-        return pairs, cells
 
     def _prepare(self, names: list[str]) -> None:
         """Complete a commit that could not be moved into place yet; raise unless another one is possible."""

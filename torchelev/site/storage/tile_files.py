@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchelev.errors import require
+from torchelev.site.storage.interface import Tile
 from torchelev.site.storage.site_header import CELLS, Header, read_cells_metadata
 from torchelev.site.storage.transaction import COMMITTED, STAGED
 from torchelev.site.storage.zarr_files import TILES_PER_AXIS, damaged, is_missing, open_array
 
-Tile = tuple[int, int]
 _HALF = TILES_PER_AXIS // 2
 _CHUNKS = Path(CELLS, "c", "0")  # in it, one folder per tile along x; all layers are in one file
 

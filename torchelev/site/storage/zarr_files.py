@@ -37,14 +37,19 @@ def cells_metadata(num_layers: int, tile_size: int) -> dict[str, Any]:
 
 def array_metadata(array: NDArray, attributes: Mapping[str, Any]) -> dict[str, Any]:
     """Return the metadata of an array that is stored as one file; its numbers must be of a kind that Zarr 3 has."""
-    name = array.dtype.newbyteorder("=").name
-    require(
-        array.dtype.kind in _KINDS and name != "float128", "arrays", "must hold bools or numbers", name, "convert them"
-    )
+    name = require_storable(array)
     fill_value = {"b": False, "f": "NaN"}.get(array.dtype.kind, 0)
     chunk = [max(1, size) for size in array.shape]
     # The file lies in the array's own folder: making and removing further ones takes longer than writing it.
     return _array(list(array.shape), chunk, name, fill_value, dict(attributes), ".")
+
+
+def require_storable(array: NDArray) -> str:
+    """Return the name of an array's type; ValueError unless Zarr 3 has it."""
+    name = array.dtype.newbyteorder("=").name
+    is_storable = array.dtype.kind in _KINDS and name != "float128"
+    require(is_storable, "arrays", "must hold bools or numbers", name, "convert them")
+    return name
 
 
 def _array(
@@ -145,8 +150,13 @@ def read_metadata(file: Path) -> dict[str, Any]:
 
 def encode_metadata(metadata: dict[str, Any]) -> bytes:
     """Return the bytes of a `zarr.json`; raise ValueError unless its attributes can be written as JSON."""
+    return encode_json(metadata, indent=1).encode()
+
+
+def encode_json(attributes: Mapping[str, Any], indent: int | None = None) -> str:
+    """Return attributes as JSON; raise ValueError if they cannot be written so."""
     try:
-        return json.dumps(metadata, indent=1, allow_nan=False).encode()
+        return json.dumps(attributes, indent=indent, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise ValueError(f"attributes: must be JSON, got a value for which {error}; {ATTRIBUTES_HINT}") from error
 
@@ -158,7 +168,7 @@ def write_metadata(file: Path, metadata: dict[str, Any]) -> None:
     file.write_bytes(encoded)
 
 
-def damaged(file: Path, error: Exception, what: str = "") -> ValueError:
+def damaged(file: Path | str, error: Exception, what: str = "") -> ValueError:
     """Return the error for a file that cannot be read; `what` names what it holds."""
     reason = " ".join(str(error).split()) or type(error).__name__
     where = f"{file} ({what})" if what else str(file)
