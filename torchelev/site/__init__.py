@@ -8,5 +8,16 @@ from torchelev.site.keyframes.keyframes import Keyframes
 from torchelev.site.shared.ranks import LostRankError
 from torchelev.site.site_config import SiteConfig
 from torchelev.site.site_map import SiteMap
+from torchelev.site.storage.interface import Version
+from torchelev.site.storage.versioned.repository import StoreError, UncertainCommitError
 
-__all__ = ["Keyframes", "LostRankError", "MergeReport", "SiteConfig", "SiteMap"]
+__all__ = [
+    "Keyframes",
+    "LostRankError",
+    "MergeReport",
+    "SiteConfig",
+    "SiteMap",
+    "StoreError",
+    "UncertainCommitError",
+    "Version",
+]
