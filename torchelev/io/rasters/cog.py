@@ -1,0 +1,87 @@
+"""Cloud-optimised GeoTIFF, by GDAL. Needs ``torchelev[geo]``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchelev.files.output_files import WriteError, atomic_path
+from torchelev.io.geotiff import Bands, encode_bands
+
+BLOCK = 256  # pixels on the side of a block
+_CACHE = 64 << 20  # bytes of blocks that GDAL keeps
+
+
+def write_cog(path: str | Path, blocks: Iterator[NDArray[np.float32]], bands: Bands) -> None:
+    """Write bands as a cloud-optimised GeoTIFF, completely or not at all.
+
+    A pixel of an overview is the mean of the known pixels below it in the level before, and unknown if all of these
+    are. Blocks are compressed by deflate without a predictor, which readers without GDAL know, too. Beside the file, a
+    plain one takes as much room until it is complete.
+
+    Args:
+        path: of the file.
+        blocks: of `BLOCK` x `BLOCK` pixels: all of the first band, row by row from north to south, and so on.
+        bands: their names and place.
+
+    Raises:
+        WriteError: the file cannot be written; an existing file is left as it was.
+        ModuleNotFoundError: tifffile or rasterio is missing.
+    """
+    import rasterio  # noqa: F401  # before anything is written
+
+    with atomic_path(path) as unfinished:
+        plain = unfinished.with_suffix(".plain")
+        try:
+            with plain.open("xb") as file:
+                encode_bands(file, blocks, bands, BLOCK)
+            with _errors_of_gdal(path):
+                _add_overviews(plain, bands.shape)
+                _copy(plain, unfinished, len(bands.names))
+        finally:
+            plain.unlink(missing_ok=True)
+
+
+def _add_overviews(plain: Path, shape: tuple[int, ...]) -> None:
+    """Add overviews to a GeoTIFF, each of half the size of the one before, down to one block."""
+    import rasterio
+    from rasterio.enums import Resampling
+
+    factors = [2**k for k in range(1, math.ceil(math.log2(max(*shape, 2) / BLOCK)) + 1)]
+    settings = {"COMPRESS_OVERVIEW": "DEFLATE", "GDAL_TIFF_OVR_BLOCKSIZE": BLOCK}
+    if factors:
+        with rasterio.Env(GDAL_CACHEMAX=_CACHE, **settings), rasterio.open(plain, "r+") as dataset:
+            dataset.build_overviews(factors, Resampling.average)
+
+
+def _copy(plain: Path, optimised: Path, num_bands: int) -> None:
+    """Copy a GeoTIFF with overviews to one that has all its tables first, and the smallest overview before others."""
+    import rasterio
+    import rasterio.shutil
+
+    options = {"COMPRESS": "DEFLATE", "TILED": "YES", "BLOCKXSIZE": BLOCK, "BLOCKYSIZE": BLOCK, "BIGTIFF": "IF_SAFER"}
+    if num_bands > 1:
+        options["INTERLEAVE"] = (
+            "BAND"  # a reader of the elevation fetches nothing else; the driver COG can from 3.11 on
+        )
+    with rasterio.Env(GDAL_CACHEMAX=_CACHE):
+        rasterio.shutil.copy(str(plain), str(optimised), driver="GTiff", COPY_SRC_OVERVIEWS="YES", **options)
+
+
+@contextmanager
+def _errors_of_gdal(path: str | Path) -> Iterator[None]:
+    """Raise errors of GDAL in the block, such as of a full disk, as WriteError."""
+    from rasterio.errors import RasterioError
+
+    try:
+        yield
+    except Exception as error:
+        is_from_gdal = isinstance(error, (RasterioError, SystemError)) or type(error).__module__ == "rasterio._err"
+        if not is_from_gdal:
+            raise
+        raise WriteError(path, f"GDAL: {error}") from error
