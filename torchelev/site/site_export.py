@@ -75,14 +75,19 @@ def choose_area(
     if extent is None:
         sides = [[_find_border(tiles, layers, axis, end) for end in (False, True)] for axis in (0, 1)]
     else:
-        box = np.asarray(extent)
-        is_box = box.shape == (4,) and box.dtype.kind in "iuf" and bool(np.isfinite(box).all())
-        is_box = is_box and bool(box[0] < box[1] and box[2] < box[3])
-        require(is_box, "area", "expected x_min, x_max, y_min, y_max in metres", repr(extent), "see site.extent")
+        check_box(extent)
         cells = [value / resolution for value in extent]
         sides = [[math.floor(cells[k] + _ROUNDING), math.ceil(cells[k + 1] - _ROUNDING)] for k in (0, 2)]
     (x, x_end), (y, y_end) = sides
     return Area((x, y), (x_end - x, y_end - y), layers, resolution, copy, color_roles(tiles.channels.configs))
+
+
+def check_box(extent: Sequence[float]) -> None:
+    """Raise ValueError unless an extent is x_min, x_max, y_min, y_max."""
+    box = np.asarray(extent)
+    is_box = box.shape == (4,) and box.dtype.kind in "iuf" and bool(np.isfinite(box).all())
+    is_box = is_box and bool(box[0] < box[1] and box[2] < box[3])
+    require(is_box, "area", "expected x_min, x_max, y_min, y_max in metres", repr(extent), "see site.extent")
 
 
 def export(path: str | Path, area: Area, place: Place, moment: Moment) -> None:
