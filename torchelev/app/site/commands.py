@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import click
 
+from torchelev.app.site.export_command import export_command
+from torchelev.app.site.import_command import import_command
+
 
 @click.group("site", short_help="Serve, list and export a site map.")
 def site_command() -> None:
     """Work with a site map: the world map of many robots, as `SiteMap(path=...)` keeps it."""
+
+
+site_command.add_command(export_command)
+site_command.add_command(import_command)

@@ -64,8 +64,8 @@ class RasterSite(OpenedSite):
 
         Its heights are fused as those of a robot are, by their variance, without an offset: what agrees is averaged,
         what contradicts a height is kept apart, and the newer one is shown once it is about as sure. So robots, which
-        measure by centimetres, override a raster of the default variance. Robots are aligned with the raster where its
-        variance is below `SiteConfig.max_std` squared.
+        measure by centimetres, override a raster of the default variance. Imported first, it fixes the site's height:
+        robots that come later are aligned with it. Later, its heights must be those of the site: give `height`.
 
         Pixels become cells by the rule of `torchelev.io.rasters.resample`. Memory does not grow with the raster, but
         does with what of it is known if the site is in memory.
