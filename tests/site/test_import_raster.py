@@ -179,6 +179,14 @@ class Interrupted(BaseException):
     """As KeyboardInterrupt, which pytest would take for its own."""
 
 
+def test_other_rasters_may_overlap(slope, tmp_path):
+    other = write_tif(tmp_path / "other.tif", np.full((10, 10), 1.1, np.float32), turned(0.0, 0.1, (0.0, 1.0)))
+    site = SiteMap(0.1)
+    site.import_raster(slope)
+    assert site.import_raster(other).cells == 100
+    assert len(site.rasters) == 2 and limits(site, "variance") == pytest.approx([0.045, 0.09])
+
+
 @pytest.mark.parametrize("error", [KeyboardInterrupt, OSError, Interrupted])
 def test_an_import_that_fails_changes_nothing(slope, path, monkeypatch, error):
     """At the third of four reads, when half of the tiles are written."""

@@ -92,13 +92,13 @@ def test_pixels_that_are_cells_keep_every_bit(tmp_path):
     np.testing.assert_array_equal(raster.heights(CORNER, SIZE, CELL), values[::-1].T)
 
 
-def test_a_centre_on_a_border_belongs_to_the_larger_number(tmp_path):
-    """Pixels of a third of a cell, whose centres lie on the borders x = 0 and 0.1: of the cells 0 and 1."""
-    values = np.arange(8, dtype=np.float32)[None].repeat(8, 0)
-    side = 0.1 / 3
-    raster = Raster.open(write_tif(tmp_path / "a.tif", values, turned(0.0, side, (-side / 2 - 3 * side, 0.3))))
-    heights = raster.heights((-1, 0), (3, 1), 0.1)[:, 0]
-    np.testing.assert_allclose(heights, [1.0, 4.0, 6.5])  # columns 0 to 2, 3 to 5, and 6 and 7
+@pytest.mark.parametrize("start", [0, -40, 70])
+def test_a_centre_on_a_border_belongs_to_the_larger_number(tmp_path, start):
+    """Pixels of a third of a cell, of which every third one has its centre on the border of two cells."""
+    values, side = np.arange(180, dtype=np.float32)[None].repeat(3, 0), 0.1 / 3
+    raster = Raster.open(write_tif(tmp_path / "a.tif", values, turned(0.0, side, (start * 0.1 - side / 2, 0.1))))
+    heights = raster.heights((start, 0), (60, 1), 0.1)[:, 0]
+    np.testing.assert_allclose(heights, 3 * np.arange(60) + 1)  # columns 3 k to 3 k + 2
 
 
 def test_nothing_is_extrapolated(tmp_path):

@@ -61,17 +61,24 @@ All of it is stored or nothing. The same heights are taken once.
     help="When it was surveyed, on the clock of the merges [s].  [default: the oldest time of the site]",
 )
 @click.option("--resolution", type=float, metavar="M", help="Cell size of a new site [m].")
-def import_command(site: Path, raster: Path, resolution: float | None, variance: float | None, **options: Any) -> None:
+def import_command(
+    site: Path,
+    raster: Path,
+    resolution: float | None,
+    area: tuple[float, ...] | None,
+    time: float | None,
+    **options: Any,
+) -> None:
     """Run `torchelev site import`; its help text is `_HELP`."""
+    from torchelev.io.rasters import Raster
     from torchelev.site import SiteMap
 
-    if variance is not None:
-        options["variance"] = variance
+    given = {name: value for name, value in options.items() if value is not None}
     with user_errors():
-        opened = SiteMap.open(site) if resolution is None else SiteMap(resolution, site)
         try:
-            with opened:
-                report = opened.import_raster(raster, **options)
+            source = Raster.open(raster, **given)  # before a site is made
+            with SiteMap.open(site) if resolution is None else SiteMap(resolution, site) as opened:
+                report = opened.import_raster(source, area=area, time=time)
         except KeyError as error:  # a layer that is not there
             raise ValueError(error.args[0]) from error
     click.echo(f"{report.cells} cells of {raster}, of which {report.contradictions} contradict what was there")
