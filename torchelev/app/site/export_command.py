@@ -56,7 +56,7 @@ def export_command(site: Path, out: Path, layers: tuple[str, ...], version: str 
     """Run `torchelev site export`; its help text is `_HELP`."""
     from torchelev.site import SiteMap
 
-    chosen = {} if version is None else {"version": version}
+    chosen: dict[str, Any] = {} if version is None else {"version": version}
     with user_errors():
         try:
             with SiteMap.open(site, read_only=True, **chosen) as opened:

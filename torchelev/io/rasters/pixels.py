@@ -49,11 +49,11 @@ class Part(NamedTuple):
 
 
 class Pixels(Protocol):
-    """Heights of a raster."""
+    """Heights of a raster, of which a part is read at a time."""
 
-    name: str
-    shape: tuple[int, int]
-    place: Place
+    name: str  #: of them, for errors
+    shape: tuple[int, int]  #: rows, columns
+    place: Place  #: in the map frame
 
     def read(self, part: Part) -> NDArray[np.float64]:
         """Return heights (rows, columns) [m], NaN where unknown."""
