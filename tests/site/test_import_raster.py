@@ -153,6 +153,7 @@ def test_an_undated_raster_on_disk_waits_for_the_first_merge(slope, tmp_path):
             site.merge(robots([(200, 200)]), time=5.0)
 
 
+@pytest.mark.slow(1)
 def test_twice_counts_once(slope, tmp_path, path):
     """Also as another file, in other blocks; other cells of it may follow."""
     site = SiteMap(0.1, path)

@@ -153,6 +153,7 @@ def test_wrong_numbers(tmp_path):
         Raster.of_layer(np.zeros(3), np.zeros(2), 0.1)
 
 
+@pytest.mark.slow(1)
 def test_a_map_begins_with_a_raster(tmp_path):
     """Unknown cells are filled with the raster's variance, known ones stay, and the first measurement prevails."""
     row, column = np.indices((60, 60))

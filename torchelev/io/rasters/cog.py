@@ -20,9 +20,9 @@ _CACHE = 64 << 20  # bytes of blocks that GDAL keeps
 def write_cog(path: str | Path, blocks: Iterator[NDArray[np.float32]], bands: Bands) -> None:
     """Write bands as a cloud-optimised GeoTIFF, completely or not at all.
 
-    A pixel of an overview is the mean of the known pixels below it in the level before, and unknown if all of these
-    are. Blocks are compressed by deflate without a predictor, which readers without GDAL know, too. Beside the file, a
-    plain one takes as much room until it is complete.
+    A pixel of an overview is the mean of all known pixels below it, and unknown if there is none. Blocks are compressed
+    by deflate without a predictor, which readers without GDAL know, too. Beside the file, a plain one takes as much
+    room until it is complete.
 
     Args:
         path: of the file.
@@ -54,9 +54,10 @@ def _add_overviews(plain: Path, shape: tuple[int, ...]) -> None:
 
     factors = [2**k for k in range(1, math.ceil(math.log2(max(*shape, 2) / BLOCK)) + 1)]
     settings = {"COMPRESS_OVERVIEW": "DEFLATE", "GDAL_TIFF_OVR_BLOCKSIZE": BLOCK}
-    if factors:
-        with rasterio.Env(GDAL_CACHEMAX=_CACHE, **settings), rasterio.open(plain, "r+") as dataset:
-            dataset.build_overviews(factors, Resampling.average)
+    with rasterio.Env(GDAL_CACHEMAX=_CACHE, **settings):
+        for factor in factors:  # made together, each would be of the one before: a mean of means
+            with rasterio.open(plain, "r+") as dataset:
+                dataset.build_overviews([factor], Resampling.average)
 
 
 def _copy(plain: Path, optimised: Path, num_bands: int) -> None:
@@ -67,7 +68,7 @@ def _copy(plain: Path, optimised: Path, num_bands: int) -> None:
     options = {"COMPRESS": "DEFLATE", "TILED": "YES", "BLOCKXSIZE": BLOCK, "BLOCKYSIZE": BLOCK, "BIGTIFF": "IF_SAFER"}
     if num_bands > 1:
         options["INTERLEAVE"] = (
-            "BAND"  # a reader of the elevation fetches nothing else; the driver COG can from 3.11 on
+            "BAND"  # a reader of the elevation fetches nothing else; GDAL's driver COG: from 3.11 on
         )
     with rasterio.Env(GDAL_CACHEMAX=_CACHE):
         rasterio.shutil.copy(str(plain), str(optimised), driver="GTiff", COPY_SRC_OVERVIEWS="YES", **options)
