@@ -56,6 +56,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         if target.exists():
             unfinished.chmod(stat.S_IMODE(target.stat().st_mode))
         os.replace(unfinished, target)
+    except WriteError:
+        raise
     except OSError as error:
         raise WriteError(path, _describe(error)) from error
     finally:

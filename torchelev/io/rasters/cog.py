@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -40,19 +40,21 @@ def write_cog(path: str | Path, blocks: Iterator[NDArray[np.float32]], bands: Ba
         try:
             with plain.open("xb") as file:
                 encode_bands(file, blocks, bands, BLOCK)
+            factors = [2**k for k in range(1, math.ceil(math.log2(max(*bands.shape, 2) / BLOCK)) + 1)]
             with _errors_of_gdal(path):
-                _add_overviews(plain, bands.shape)
+                _add_overviews(plain, factors)
+                _require_complete(plain, len(factors), path)
                 _copy(plain, unfinished, len(bands.names))
+                _require_complete(unfinished, len(factors), path)
         finally:
             plain.unlink(missing_ok=True)
 
 
-def _add_overviews(plain: Path, shape: tuple[int, ...]) -> None:
-    """Add overviews to a GeoTIFF, each of half the size of the one before, down to one block."""
+def _add_overviews(plain: Path, factors: list[int]) -> None:
+    """Add an overview to a GeoTIFF for each factor."""
     import rasterio
     from rasterio.enums import Resampling
 
-    factors = [2**k for k in range(1, math.ceil(math.log2(max(*shape, 2) / BLOCK)) + 1)]
     settings = {"COMPRESS_OVERVIEW": "DEFLATE", "GDAL_TIFF_OVR_BLOCKSIZE": BLOCK}
     with rasterio.Env(GDAL_CACHEMAX=_CACHE, **settings):
         for factor in factors:  # made together, each would be of the one before: a mean of means
@@ -72,6 +74,19 @@ def _copy(plain: Path, optimised: Path, num_bands: int) -> None:
         )
     with rasterio.Env(GDAL_CACHEMAX=_CACHE):
         rasterio.shutil.copy(str(plain), str(optimised), driver="GTiff", COPY_SRC_OVERVIEWS="YES", **options)
+
+
+def _require_complete(file: Path, num_overviews: int, path: str | Path) -> None:
+    """Raise WriteError unless a GeoTIFF has all overviews and blocks: a full disk may be no error to GDAL."""
+    import tifffile
+
+    size, pages, blocks = file.stat().st_size, [], []
+    with suppress(tifffile.TiffFileError), tifffile.TiffFile(file) as tiff:
+        pages = list(tiff.pages)
+        blocks = [block for page in pages for block in zip(page.dataoffsets, page.databytecounts, strict=True)]
+    has_all = len(pages) == num_overviews + 1
+    if not has_all or not all(start > 0 and number > 0 and start + number <= size for start, number in blocks):
+        raise WriteError(path, "GDAL has left it incomplete: is the disk full?")
 
 
 @contextmanager
