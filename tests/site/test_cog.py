@@ -155,7 +155,7 @@ def test_a_failure_of_gdal_leaves_the_older_file(site, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow(2)
-@pytest.mark.parametrize("share", [0.3, 0.7, 0.76, 0.85, 0.95, 0.999])
+@pytest.mark.parametrize("share", [0.3, 0.7, 0.76, 0.85, 0.975, 0.999])
 def test_a_full_disk_leaves_the_older_file(patchy, tmp_path, share):
     """A limit of the file's size, which GDAL meets in the pixels, in the overviews or in the copy."""
     resource = pytest.importorskip("resource")
