@@ -15,7 +15,7 @@ BAD_INPUT, EMPTY_MAP = 2, 3  # exit codes
 _EXTRAS = {
     "rosbags": "bags", "mcap": "bags", "av": "video", "viser": "view", "trimesh": "view", "tensorstore": "site",
     "icechunk": "site", "zarr": "site",
-    "kiss_icp": "odometry", "onnxruntime": "deploy",
+    "kiss_icp": "odometry", "onnxruntime": "deploy", "tifffile": "geo", "rasterio": "geo",
 }  # fmt: skip
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import click
 
 from torchelev.app.site import version_commands
+from torchelev.app.site.export_command import export_command
+from torchelev.app.site.import_command import import_command
 
 
 @click.group("site", short_help="Serve, list, go back to and export a site map.")
@@ -18,3 +20,5 @@ def site_command() -> None:
 
 for command in version_commands.COMMANDS:
     site_command.add_command(command)
+site_command.add_command(export_command)
+site_command.add_command(import_command)
