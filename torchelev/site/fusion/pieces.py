@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.site.tiles import CELL_BITS, CELLS, TILE, Tile, locate_tiles
+from torchelev.site.tiles import CELLS, TILE, Tile, locate_tiles
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -19,20 +19,24 @@ _GROUP = 16  # tiles at a time: their intermediate values stay in a CPU's caches
 
 
 class Pieces(NamedTuple):
-    """The parts of windows that lie on a group of tiles."""
+    """The parts of windows that lie on a group of tiles, line by line, in the order of tiles and robots."""
 
     tiles: list[Tile]  #: the group
-    robot: Int[Tensor, "P"]  #: whose window it is
-    tile: Int[Tensor, "P"]  #: number in `tiles`
-    place: Int[Tensor, "P T T"]  #: of each of the tile's cells in the flat windows
-    is_inside: Bool[Tensor, "P T T"]  #: the window holds that cell
+    cell: Int[Tensor, "K"]  #: number in the group of each cell that windows hold
+    place: Int[Tensor, "K"]  #: number of the cell in the flat windows
+
+    def find(self, mask: Bool[Tensor, "B H W"]) -> tuple[Tensor, Tensor]:
+        """Return cell number in the group and place in the flat windows of the cells of a mask, (K,) each."""
+        chosen = mask.reshape(-1).index_select(0, self.place)
+        if chosen.all():
+            return self.cell, self.place
+        number = chosen.nonzero()[:, 0]
+        return self.cell.index_select(0, number), self.place.index_select(0, number)
 
     def select(self, mask: Bool[Tensor, "B H W"]) -> tuple[Tensor, Tensor, Tensor]:
         """Return robot, cell number in the group and place in the flat windows of the cells of a mask, (K,) each."""
-        chosen = (self.is_inside & mask.reshape(-1).take(self.place)).view(-1).nonzero()[:, 0]
-        piece = chosen >> CELL_BITS
-        cell = (self.tile - torch.arange(len(self.tile), device=chosen.device)).index_select(0, piece) * CELLS + chosen
-        return self.robot.index_select(0, piece), cell, self.place.view(-1).index_select(0, chosen)
+        cell, place = self.find(mask)
+        return place // mask[0].numel(), cell, place
 
 
 class Group(NamedTuple):
@@ -68,10 +72,25 @@ def _touched(corner: Int[Tensor, "B"], lines: Float[Tensor, "B size"]) -> Bool[T
 
 
 def _cut(tiles: list[Tile], robot: Tensor, tile: Tensor, corner: Tensor, size: tuple[int, ...]) -> Pieces:
-    H, W = size
-    origin = torch.tensor(tiles, device=corner.device)[tile] * TILE - corner[robot]
-    within = torch.arange(TILE, device=corner.device)
-    i, j = origin[:, :1] + within, origin[:, 1:] + within
-    inside_i, inside_j = (i >= 0) & (i < H), (j >= 0) & (j < W)
-    place = (robot[:, None] * H + i.clamp(0, H - 1))[:, :, None] * W + j.clamp(0, W - 1)[:, None]
-    return Pieces(tiles, robot, tile, place, inside_i[:, :, None] & inside_j[:, None])
+    origin = torch.tensor(tiles, device=corner.device).index_select(0, tile) * TILE - corner.index_select(0, robot)
+    last = torch.minimum(origin + TILE, torch.tensor(size, device=corner.device))
+    first = origin.clamp(min=0)
+    height, width = (last - first).unbind(1)
+    # Lines of cells: where they begin in the windows and in the tiles.
+    piece, number = _enumerate(height)
+    i, j = first[:, 0].index_select(0, piece) + number, first[:, 1].index_select(0, piece)
+    place = (robot.index_select(0, piece) * size[0] + i) * size[1] + j
+    at_i, at_j = (torch.stack([i, j]) - origin.index_select(0, piece).T).unbind(0)
+    cell = tile.index_select(0, piece) * CELLS + at_i * TILE + at_j
+    length = width.index_select(0, piece)
+    begin = length.cumsum(0) - length
+    line = torch.repeat_interleave(torch.stack([cell - begin, place - begin], 1), length, 0)
+    number = torch.arange(len(line), device=line.device)
+    return Pieces(tiles, *(column + number for column in line.unbind(1)))
+
+
+def _enumerate(counts: Int[Tensor, "P"]) -> tuple[Tensor, Tensor]:
+    """Return for each of as many items as are counted whose it is, and its number among those."""
+    whose = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts)
+    number = torch.arange(len(whose), device=counts.device)
+    return whose, number - (counts.cumsum(0) - counts).index_select(0, whose)
