@@ -2,14 +2,12 @@
 
 import numpy as np
 import pytest
-import torch
 import torch.distributed as dist
 
 from tests.site import ranks
 from tests.site.ranks import run_ranks
 from torchelev.site import SiteMap
-from torchelev.site.fusion.windows import Alignment, Windows, read_windows, snapshot
-from torchelev.site.shared.packing import Layout, pack, unpack
+from torchelev.site.shared.owners import owners_of
 
 SHARES = {
     2: [[0], list(range(1, 11))],
@@ -105,7 +103,7 @@ EXPECTED = {
     "given": "time: must be the same on all ranks, got not given on rank 0 and given on rank 1",
     "call": "call: must be the same on all ranks, got SiteMap on rank 0 and merge on rank 1",
     "disk": "cannot be written (No space left on device); all that was stored before is unchanged",
-    "reading": "rank 1: tile (0, 0): must be readable",
+    "reading": f"rank {owners_of([(0, 0)], 2)[0]}: tile (0, 0): must be readable",
 }
 
 
@@ -127,46 +125,3 @@ def test_a_group_that_is_not_initialised_is_refused():
     assert not dist.is_initialized()
     with pytest.raises(ValueError, match="group: must be initialised, got none; call torch.distributed"):
         SiteMap(0.1, group=object())
-
-
-@pytest.mark.parametrize("with_contribution", [False, True])
-def test_packed_windows_are_exact_and_as_large_as_documented(with_contribution):
-    emap = ranks.all_robots()
-    emap.corner.copy_(emap.corner + 2**40)
-    ranks.measure(emap, 1)
-    emap.corner.add_(2**40)
-    windows = read_windows(emap, emap.state, 1e9 + 1e-7, None)
-    contribution = (
-        snapshot(emap, windows, ranks_alignment(emap), emap.state.elapsed, emap.num_resets - 1)
-        if with_contribution
-        else None
-    )
-    windows, layout = windows._replace(contribution=contribution), Layout(30, 26, with_contribution)
-    rows = pack(windows, layout)
-    assert rows.shape == (ranks.NUM_ROBOTS, layout.num_bytes)
-    assert layout.num_bytes == pytest.approx(
-        30 * 26 * (32.625 if with_contribution else 20.5) + (88 if with_contribution else 32), abs=4
-    )
-    assert_equal(windows, unpack(rows, layout))
-
-
-def ranks_alignment(emap):
-    generator = torch.Generator().manual_seed(0)
-    shifts = torch.rand(emap.num_envs, 3, dtype=torch.float64, generator=generator)
-    return Alignment(shifts[:, 0], shifts[:, 1:], torch.zeros(emap.num_envs, dtype=torch.bool))
-
-
-def assert_equal(windows, found):
-    """All bits that a merge reads are the same."""
-    mine, theirs = windows.known, found.known
-    for name in ("corner", "now", "rate", "is_known", "variance", "age"):
-        assert torch.equal(getattr(mine, name), getattr(theirs, name)), name
-    assert torch.equal(mine.elevation[mine.is_known], theirs.elevation[mine.is_known])
-    assert torch.equal(windows.upper_bound[windows.is_bounded], found.upper_bound[windows.is_bounded])
-    for name in Windows._fields[1:4] + Windows._fields[5:7]:
-        assert torch.equal(getattr(windows, name), getattr(found, name)), name
-    assert (windows.contribution is None) == (found.contribution is None)
-    if windows.contribution is not None:
-        pairs = [*zip(windows.contribution.known, found.contribution.known, strict=True)]
-        pairs += zip(windows.contribution.alignment, found.contribution.alignment, strict=True)
-        assert all(torch.equal(a, b) for a, b in pairs)

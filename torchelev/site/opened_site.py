@@ -13,10 +13,13 @@ import torch
 from torchelev.errors import require, require_positive
 from torchelev.inputs import checks
 from torchelev.site.channels import SiteChannels
+from torchelev.site.fusion.exchange import Exchange
 from torchelev.site.fusion.merge import Merged
 from torchelev.site.keyframes.keyframe_log import Arrays, KeyframeLog
 from torchelev.site.readable_site import ReadableSite
 from torchelev.site.shared.collective import shared_transaction
+from torchelev.site.shared.exchange import exchange_of
+from torchelev.site.shared.owners import owners_of
 from torchelev.site.shared.ranks import Ranks
 from torchelev.site.site_config import SiteConfig
 from torchelev.site.site_levels import SiteLevels
@@ -140,6 +143,11 @@ class OpenedSite(ReadableSite):
             self._keyframes = None if merges is None else KeyframeLog(self._store, merges)
 
     @property
+    def _exchange(self) -> Exchange:
+        """What a merge sends to other ranks."""
+        return exchange_of(self._ranks)
+
+    @property
     def version(self) -> str:
         """The id of the version that the site shows: of its last merge, or of the one that it was opened at."""
         return str(self._num_commits)
@@ -171,6 +179,8 @@ class OpenedSite(ReadableSite):
                 raise
             self._interrupted = error  # after the commit: raised once memory has followed
         self._time, self._num_commits = time, attributes["num_commits"]
+        if self._ranks.size > 1:  # other ranks have written theirs
+            self._tiles.forget(lambda tiles: [n != self._ranks.rank for n in owners_of(tiles, self._ranks.size)])
         return contradictions
 
     def _raise_interrupted(self) -> None:

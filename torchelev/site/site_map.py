@@ -39,8 +39,9 @@ from torchelev.site.keyframes.keyframe_log import KeyframeLog, arrays_of, change
 from torchelev.site.keyframes.keyframes import Keyframes, Recorded, correct, record
 from torchelev.site.keyframes.rebuild import merge_recorded, rebuild_moved
 from torchelev.site.opened_site import OpenedSite
-from torchelev.site.shared.collective import gather_windows, open_shared
+from torchelev.site.shared.collective import open_shared
 from torchelev.site.shared.ranks import Ranks
+from torchelev.site.shared.shared_merge import gather_tiles, merge_shared
 from torchelev.site.site_config import SiteConfig
 from torchelev.site.site_levels import SiteLevels
 from torchelev.site.tiles import LAYERS, locate
@@ -181,9 +182,7 @@ class SiteMap(OpenedSite):
         now = now if time is None else self._since_epoch(now)
         state = self._bring(emap)
         windows = read_windows(emap, state, now, contribution)
-        all_windows, own = gather_windows(self._ranks, windows, plans)
-        all_aligned = self._align(all_windows, align, tilt)
-        alignment = Alignment(*(value[own] for value in all_aligned))
+        alignment = self._align(windows, align, tilt)
         new = self._record(windows, alignment, T_map_base, now)
         keyframes = torch.full_like(state.elapsed, -1) if new is None else new.ids
         number = self._num_commits + 1
@@ -192,12 +191,12 @@ class SiteMap(OpenedSite):
         surfaces, levels = None, self._tiles.levels.cfg
         if levels is not None:  # without a group
             windows, surfaces = read_surfaces(emap, state, windows, self.resolution, levels.min_gap)
-            all_windows = windows
         stack = None if surfaces is None else surfaces.now
         contribution = snapshot(emap, windows, alignment, state.elapsed, keyframes, shares, stack)
         if self._store is None and new is None:  # interrupted, memory may hold a part, which must not count twice
             _contributions.setdefault(emap, {})[self._id] = contribution
-        contradictions = self._fuse(all_windows, all_aligned, now, new, changes, surfaces)[own]
+        robots = [plan["robots"] for plan in plans]
+        contradictions = self._fuse(windows, alignment, robots, now, new, changes, surfaces)
         _contributions.setdefault(emap, {})[self._id] = contribution
         self._raise_interrupted()
         return MergeReport(*alignment, count(windows.is_new), contradictions)
@@ -261,7 +260,7 @@ class SiteMap(OpenedSite):
         if not with_offsets:
             return no_alignment(len(windows.known.corner), self._tiles.device)
         gap = self._tiles.levels.max_difference
-        return align(windows, self._read_cells, self.resolution, self.cfg, with_tilt, gap)
+        return align(windows, self._read_cells, self.resolution, self.cfg, with_tilt, gap, self._exchange)
 
     def _read_cells(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """Return the site's elevation and variance at cells of the lattice, NaN where unknown."""
@@ -279,13 +278,21 @@ class SiteMap(OpenedSite):
         self,
         windows: Windows,
         alignment: Alignment,
+        robots: list[int],
         now: float,
         new: Recorded | None,
         changes: dict[str, Change],
         surfaces: SurfaceChange | None,
     ) -> Int[Tensor, "B"]:
-        """Fuse windows, or their keyframes, into tiles; return each robot's contradictions."""
-        rate, time = self._clock.rate, max(self._time, now)
+        """Fuse windows, or their keyframes, into tiles; return each robot's contradictions. `robots`: of each rank."""
+        rate, time, exchange = self._clock.rate, max(self._time, now), self._exchange
+        if exchange.size > 1:
+            first, number = sum(robots[: exchange.rank]), sum(robots)
+            scale = self.resolution, rate, self.cfg
+            parts = merge_shared(self._tiles, windows, alignment, first, number, *scale, exchange)
+            parts = parts if self._store else gather_tiles(parts, exchange)
+            contradictions = exchange.sum(self._write(parts, time, number))
+            return contradictions[first : first + robots[exchange.rank]]
         if self._keyframes is None or new is None:
             parts = merge_windows(self._tiles, windows, alignment, self.resolution, rate, self.cfg, changes, surfaces)
             return self._write(parts, time, len(windows.known.corner))

@@ -65,7 +65,7 @@ def align(
 def _count_overlaps(
     find: Callable[[], Pairs], N: int, min_overlap: int, exchange: Exchange
 ) -> tuple[Pairs, Bool[Tensor, "M M"], int]:
-    """Return the pairs of windows, and the site, that overlap far enough, which these are, and the pairs of all ranks."""
+    """Return the pairs of heights where windows overlap far enough, where they do, and how many all ranks have."""
     found: list[Pairs] = []
 
     def count() -> Int[Tensor, "U 2"]:
@@ -165,9 +165,7 @@ def find_median(values: Float[Tensor, "P"], number: int, exchange: Exchange) -> 
     return low + (high - low) * (rank - before + 0.5) / (int(below[place]) - before)
 
 
-def _sum_moments(
-    weight: Tensor, pairs: Pairs, edge: Tensor, num_edges: int, size: int
-) -> Float[Tensor, "U m m+1"]:
+def _sum_moments(weight: Tensor, pairs: Pairs, edge: Tensor, num_edges: int, size: int) -> Float[Tensor, "U m m+1"]:
     """Return the weighted sums of all products of columns with columns, and with the difference, per edge."""
     columns = [None] if pairs.position is None else [None, *pairs.position.double()]
     m = len(columns)

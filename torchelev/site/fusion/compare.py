@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 _NEIGHBORS = 8  # windows of a cell that each window is compared with; the others follow through these
 _MAX_PAIRS = 1 << 17
+_BYTES = 16  # of a cell that is sent to the owner of its tile
 
 ReadSite = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]  # cell numbers x, y (K,) -> elevation, variance (K,)
 
@@ -107,7 +108,7 @@ def find_pairs(
 
 
 def choose_compared(windows: Windows, robots: Robots, cfg: SiteConfig) -> Compared:
-    """Return the heights of this rank's windows that are compared: of flat and certain cells, thinned on the lattice."""
+    """Return the heights of this rank's windows to compare: of flat and certain cells, thinned on the lattice."""
     known, corner = windows.known, windows.known.corner
     (B, H, W), N = known.elevation.shape, len(robots.corner)
     stride = math.ceil(math.sqrt(N * H * W / cfg.max_compared))
@@ -145,21 +146,19 @@ def _lattice(compared: Compared, robots: Robots, size: tuple[int, ...]) -> tuple
 
 
 def _deal(compared: Compared, robots: Robots, size: tuple[int, ...], exchange: Exchange) -> tuple[Compared, int]:
-    """Send cells to the owners of their tiles; return those of this rank, in the order of windows, and how many all are.
+    """Send cells to the owners of their tiles; return those of this rank, by windows, and how many all are."""
 
-    A cell takes 16 bytes.
-    """
-
-    def messages() -> list[Tensor]:
+    def send() -> tuple[Tensor, list[int]]:
         x, y = _lattice(compared, robots, size)
         owner = exchange.find_owners(x // TILE, y // TILE)
-        parts = (compared.select((owner == rank).nonzero()[:, 0]) for rank in range(exchange.size))
-        return [torch.stack([*map(_as_int32, part)]).view(torch.uint8).view(-1) for part in parts]
+        chosen = [(owner == rank).nonzero()[:, 0] for rank in range(exchange.size)]
+        parts = [torch.stack([*map(_as_int32, compared.select(its))]).view(-1) for its in chosen]
+        return torch.cat(parts).view(torch.uint8), [_BYTES * len(its) for its in chosen]
 
-    received, num_bytes = exchange.deal(messages)
+    received, num_bytes = exchange.deal(send)
     values = torch.cat([row.view(torch.int32).view(4, -1) for row in received], 1)
     heights = (value.view(torch.float32) for value in values[2:])
-    return Compared(values[0].long(), values[1].long(), *heights), num_bytes // 16
+    return Compared(values[0].long(), values[1].long(), *heights), num_bytes // _BYTES
 
 
 def _as_int32(values: Tensor) -> Tensor:

@@ -21,7 +21,7 @@ MIN_VARIANCE = 1e-10  # [m^2]
 
 
 class Offers(NamedTuple):
-    """The heights of all cells of B windows, in the site's frame, flat; what is not new, or not known, does not count."""
+    """The heights of all cells of B windows, in the site's frame, flat; those that are not new do not count."""
 
     heights: Heights  #: (B * H * W,) each
     relief: Float[Tensor, "BHW"]  #: [m^2] variance of heights within the cell

@@ -30,13 +30,16 @@ class Exchange:
         """Return the sum of the values of all ranks, of one shape: the same bits on all of them."""
         return values
 
-    def deal(self, make: Callable[[], Sequence[UInt8[Tensor, "n"]]]) -> tuple[list[UInt8[Tensor, "m"]], int]:
-        """Send the bytes that `make` returns to each rank; return those from each, and the number of all that are sent.
+    def deal(
+        self, make: Callable[[], tuple[UInt8[Tensor, "n"], Sequence[int]]]
+    ) -> tuple[list[UInt8[Tensor, "m"]], int]:
+        """Send bytes to each rank; return those from each, and the number of all that are sent.
 
-        If `make` raises on one rank, all raise.
+        Args:
+            make: returns the bytes for all ranks, and how many are for each. If it raises on one rank, all raise.
         """
-        messages = list(make())
-        return messages, sum(map(len, messages))
+        memory, lengths = make()
+        return [memory], sum(lengths)
 
     def find_owners(self, x: Int[Tensor, "K"], y: Int[Tensor, "K"]) -> Int[Tensor, "K"]:
         """Return the ranks that fuse the tiles with numbers x, y."""

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
+    from jaxtyping import Float, Int
 
 _TILT_STD = 0.05  # [rad] a priori, which keeps windows with little overlap level
 _DENSE = 300  # unknowns up to which a factorisation is faster than iterating

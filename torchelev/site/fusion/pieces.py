@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -15,7 +15,7 @@ from torchelev.site.tiles import CELLS, TILE, Tile, locate_tiles
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-_GROUP = 16  # tiles at a time: their intermediate values stay in a CPU's caches
+GROUP = 16  # tiles at a time: their intermediate values stay in a CPU's caches
 
 
 class Pieces(NamedTuple):
@@ -48,20 +48,40 @@ class Group(NamedTuple):
 
 def group_tiles(corner: Int[Tensor, "B 2"], mask: Bool[Tensor, "B H W"]) -> list[Group]:
     """Return the tiles below windows that hold cells of the mask, in groups."""
+    tiles, number, robot = _find_tiles(corner, mask)
+    starts = torch.arange(0, len(tiles), GROUP, device=number.device)
+    ends = [*torch.searchsorted(number, starts).tolist(), len(number)]
+    groups = []
+    for k, (start, end) in zip(starts.tolist(), itertools.pairwise(ends), strict=True):
+        chosen = tiles[k : k + GROUP]
+        cut = partial(_cut, chosen, robot[start:end], number[start:end] - k, corner, mask.shape[1:])
+        groups.append(Group(chosen, cut))
+    return groups
+
+
+def cut_windows(
+    corner: Int[Tensor, "B 2"], mask: Bool[Tensor, "B H W"], find_owners: Callable[[Tensor, Tensor], Tensor], size: int
+) -> Iterator[Pieces]:
+    """Yield the pieces of windows on the tiles of each of `size` owners, of tiles that hold cells of the mask."""
+    tiles, number, robot = _find_tiles(corner, mask)
+    owner = find_owners(*torch.tensor(tiles, dtype=torch.int64, device=number.device).view(-1, 2).unbind(1))
+    for rank in range(size):
+        own = (owner == rank).nonzero()[:, 0]
+        place = torch.full_like(owner, -1).index_copy_(0, own, torch.arange(len(own), device=own.device))
+        tile = place.index_select(0, number)
+        chosen = (tile >= 0).nonzero()[:, 0]
+        its = [tiles[k] for k in own.tolist()]
+        yield _cut(its, robot.index_select(0, chosen), tile.index_select(0, chosen), corner, mask.shape[1:])
+
+
+def _find_tiles(corner: Int[Tensor, "B 2"], mask: Bool[Tensor, "B H W"]) -> tuple[list[Tile], Tensor, Tensor]:
+    """Return the tiles that hold cells of the mask, and the pieces of windows on them, in their order: tile, robot."""
     first, lines = corner // TILE, mask.float()  # bytes take ten times as long
     rows, columns = _touched(corner[:, 0], lines.amax(2)), _touched(corner[:, 1], lines.amax(1))
     robot, i, j = (rows[:, :, None] & columns[:, None, :]).nonzero().unbind(1)
     tiles, number = locate_tiles(first[robot, 0] + i, first[robot, 1] + j)
     order = torch.argsort(number, stable=True)
-    robot, number = robot[order], number[order]
-    starts = torch.arange(0, len(tiles), _GROUP, device=number.device)
-    ends = [*torch.searchsorted(number, starts).tolist(), len(number)]
-    groups = []
-    for k, (start, end) in zip(starts.tolist(), itertools.pairwise(ends), strict=True):
-        chosen = tiles[k : k + _GROUP]
-        cut = partial(_cut, chosen, robot[start:end], number[start:end] - k, corner, mask.shape[1:])
-        groups.append(Group(chosen, cut))
-    return groups
+    return tiles, number[order], robot[order]
 
 
 def _touched(corner: Int[Tensor, "B"], lines: Float[Tensor, "B size"]) -> Bool[Tensor, "B t"]:
@@ -72,7 +92,9 @@ def _touched(corner: Int[Tensor, "B"], lines: Float[Tensor, "B size"]) -> Bool[T
 
 
 def _cut(tiles: list[Tile], robot: Tensor, tile: Tensor, corner: Tensor, size: tuple[int, ...]) -> Pieces:
-    origin = torch.tensor(tiles, device=corner.device).index_select(0, tile) * TILE - corner.index_select(0, robot)
+    origin = torch.tensor(tiles, dtype=torch.int64, device=corner.device).view(-1, 2).index_select(
+        0, tile
+    ) * TILE - corner.index_select(0, robot)
     last = torch.minimum(origin + TILE, torch.tensor(size, device=corner.device))
     first = origin.clamp(min=0)
     height, width = (last - first).unbind(1)

@@ -20,16 +20,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import torch
-
 from torchelev.errors import require
 from torchelev.site.channels import SiteChannels
-from torchelev.site.fusion.windows import Windows
-from torchelev.site.shared.packing import Layout, pack, unpack
 from torchelev.site.shared.ranks import Ranks
 from torchelev.site.site_levels import SiteLevels
 from torchelev.site.tiles import LAYERS, TILE
@@ -78,26 +74,6 @@ def _open(
     return store
 
 
-def gather_windows(ranks: Ranks, windows: Windows, plans: list[dict[str, Any]]) -> tuple[Windows, slice]:
-    """Return the windows of all ranks' robots, in the order of the ranks, and where those of this rank are.
-
-    Args:
-        ranks: of the site.
-        windows: of this rank.
-        plans: what the ranks sent by `exchange`: their numbers of `robots`, and whether any has `contributed` before.
-    """
-    numbers = [plan["robots"] for plan in plans]
-    own = slice(sum(numbers[: ranks.rank]), sum(numbers[: ranks.rank + 1]))
-    if ranks.size == 1:
-        return windows, own
-    H, W = windows.known.elevation.shape[1:]
-    layout = Layout(H, W, any(plan["contributed"] for plan in plans))
-    rows = pack(windows, layout)
-    padded = torch.nn.functional.pad(rows, (0, 0, 0, max(numbers) - len(rows)))
-    gathered = ranks.all_gather("merge", padded)
-    return unpack(torch.cat([rows[:number] for rows, number in zip(gathered, numbers, strict=True)]), layout), own
-
-
 @contextmanager
 def shared_transaction(
     ranks: Ranks, store: TileStore | None, attributes: Mapping[str, Any], arrays: Mapping[str, Any] | None = None
@@ -109,12 +85,21 @@ def shared_transaction(
     if store is None:
         yield _write_nothing
         return
-    with ranks.together("merge"):
-        with store.transaction(attributes, arrays) if ranks.rank == 0 else nullcontext(_write_nothing) as write:
-            with ranks.together("merge"):
+    with ExitStack() as transaction:  # of rank 0; left with an error, it commits nothing
+        with ranks.together("merge"):
+            if ranks.rank == 0:
+                write = transaction.enter_context(store.transaction(attributes, arrays))
+        with ranks.together("merge"):
+            if ranks.rank == 0:
                 yield write
-    if ranks.rank:
+            else:
+                with store.join_transaction() as write:
+                    yield write
+        with ranks.together("merge"):
+            transaction.close()
+    if ranks.size > 1:
         store.refresh()
+    if ranks.rank:
         _require_current(store, attributes)
 
 

@@ -207,6 +207,23 @@ class TileStore:
             with suppress(OSError):  # it is committed: reading finds it, and the next commit moves it
                 finish(self.path)
 
+    @contextmanager
+    def join_transaction(self) -> Iterator[Callable[[Sequence[Tile] | NDArray, ArrayLike], None]]:
+        """Write tiles into the transaction that is open in another process, which commits them, too.
+
+        Yields:
+            A function of tiles and values, as for `commit`. All is written at the end of the block.
+        """
+        writes: list[Any] = []
+
+        def write(tiles: Sequence[Tile] | NDArray, values: ArrayLike) -> None:
+            writes.extend(self._files.stage(*self._check(tiles, values)))
+
+        try:
+            yield write
+        finally:
+            wait_for(writes)
+
     @property
     def is_read_only(self) -> bool:
         """Whether it is open read-only, or closed."""
