@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -42,26 +43,26 @@ def read_offers(windows: Windows, alignment: Alignment, resolution: float) -> Of
         resolution: [m].
     """
     contribution, before = windows.contribution, windows.before
-    shape = 4 if before is None else 7, *windows.is_new.shape
-    layers = torch.empty(shape, device=windows.is_new.device)
+    like = windows.is_new  # one by one: the system takes back what is larger than 32 MB
+    layers = [torch.empty(like.shape, device=like.device) for _ in range(4 if before is None else 7)]
     if contribution is not None and before is not None:
         aligned = contribution.alignment.of_moved((before.corner - contribution.known.corner) * resolution)
-    for start in range(0, layers.shape[1], _ROBOTS):  # some at a time, whose values stay in a CPU's caches
+    for start in range(0, len(like), _ROBOTS):  # some at a time, whose values stay in a CPU's caches
         part = slice(start, start + _ROBOTS)
-        own = layers[:, part]
+        own = [layer[part] for layer in layers]
         _write_heights(own[:3], windows.known, alignment, part, resolution)
         slope = windows.gradient_x[part].square() + windows.gradient_y[part].square()
-        own[3] = torch.where(windows.has_normal[part], slope, _STEEPEST**2)
-        own[3].mul_(resolution**2 * _WITHIN_CELL)
+        slope = torch.where(windows.has_normal[part], slope, _STEEPEST**2)
+        torch.mul(slope, resolution**2 * _WITHIN_CELL, out=own[3])
         if before is not None:
             _write_heights(own[4:], before, aligned, part, resolution)
             own[6].masked_fill_(~before.is_known[part], torch.nan)
-    flat = layers.flatten(1)
+    flat = [layer.view(-1) for layer in layers]
     return Offers(Heights(*flat[:3]), flat[3], None if before is None else Heights(*flat[4:]))
 
 
 def _write_heights(
-    layers: Float[Tensor, "3 b H W"], known: Known, alignment: Alignment, part: slice, resolution: float
+    layers: Sequence[Float[Tensor, "b H W"]], known: Known, alignment: Alignment, part: slice, resolution: float
 ) -> None:
     """Write elevations, variances and times of some windows, in the site's frame."""
     elevation, variance, time = layers

@@ -106,9 +106,11 @@ def _cut(tiles: list[Tile], robot: Tensor, tile: Tensor, corner: Tensor, size: t
     cell = tile.index_select(0, piece) * CELLS + at_i * TILE + at_j
     length = width.index_select(0, piece)
     begin = length.cumsum(0) - length
-    line = torch.repeat_interleave(torch.stack([cell - begin, place - begin], 1), length, 0)
-    number = torch.arange(len(line), device=line.device)
-    return Pieces(tiles, *(column + number for column in line.unbind(1)))
+    number = torch.arange(int(length.sum()), device=length.device)
+    lines = (
+        torch.repeat_interleave(start - begin, length, output_size=len(number)).add_(number) for start in (cell, place)
+    )
+    return Pieces(tiles, *lines)
 
 
 def _enumerate(counts: Int[Tensor, "P"]) -> tuple[Tensor, Tensor]:

@@ -22,7 +22,7 @@ class Said(NamedTuple):
     """What windows say of a group of tiles."""
 
     entries: Entries  #: heights
-    robot: Int[Tensor, "k"]  #: whose they are, numbered among those of all ranks
+    place: Int[Tensor, "k"]  #: of them in the flat windows of all ranks
     bounded: Int[Tensor, "u"]  #: cells that have an upper bound
     bound: Float[Tensor, "u"]  #: [m] in the site's frame
 
@@ -50,17 +50,17 @@ class OwnPart(NamedTuple):
     windows: Windows
     alignment: Alignment
     offers: Offers
-    first: int  #: number of the rank's first robot
+    first: int  #: place of the rank's first cell in the flat windows of all ranks
     resolution: float  #: [m]
 
     def at(self, group: Int[Tensor, "g 2"]) -> Said:
         """Return what it says of a group of tiles."""
-        size, chosen = self.windows.is_new[0].numel(), self.chosen
+        chosen = self.chosen
         cell, part = _cut(chosen.tiles, chosen.cell, group)
         bounded, bound_part = _cut(chosen.tiles, chosen.bounded, group)
         place = chosen.place[part]
         bound = read_bounds(self.windows, self.alignment, chosen.bound_place[bound_part], self.resolution)
-        return Said(self.offers.at(cell, place), place // size + self.first, bounded, bound)
+        return Said(self.offers.at(cell, place), place + self.first, bounded, bound)
 
 
 def read_bounds(windows: Windows, alignment: Alignment, place: Tensor, resolution: float) -> Float[Tensor, "u"]:
@@ -70,11 +70,11 @@ def read_bounds(windows: Windows, alignment: Alignment, place: Tensor, resolutio
 
 
 class SentPart(NamedTuple):
-    """What another rank's windows say of tiles: 24 bytes for each cell that is new, 36 once a robot has contributed."""
+    """What another rank's windows say of tiles: 28 bytes for each cell that is new, 40 once a robot has contributed."""
 
     tiles: Int[Tensor, "n 2"]  #: in ascending order
     cell: Int[Tensor, "K"]  #: number of the tile * CELLS + number of the cell, by tiles, int32
-    robot: Int[Tensor, "K"]  #: numbered among those of all ranks, int32
+    place: Int[Tensor, "K"]  #: in the flat windows of all ranks
     values: Float[Tensor, "v K"]  #: elevation, variance, time, relief, and, if a robot has contributed, these 3 again
     bounded: Int[Tensor, "U"]  #: cells that have an upper bound, by tiles, int32
     bound: Float[Tensor, "U"]  #: [m] in the site's frame
@@ -86,7 +86,7 @@ class SentPart(NamedTuple):
         values = self.values[:, part]
         contributed = Heights(*values[4:]) if len(values) > 4 else None
         entries = Entries(cell, Heights(*values[:3]), values[3], contributed)
-        return Said(entries, self.robot[part].long(), bounded, self.bound[bound_part])
+        return Said(entries, self.place[part], bounded, self.bound[bound_part])
 
     @staticmethod
     def shapes(chosen: Chosen, number: int) -> list[Shape]:
@@ -94,14 +94,14 @@ class SentPart(NamedTuple):
         n, K, U = len(chosen.tiles), len(chosen.cell), len(chosen.bounded)
         whole, real = torch.int32, torch.float32
         return [
-            (torch.int64, (n, 2)), (whole, (K,)), (whole, (K,)), (real, (number, K)), (whole, (U,)), (real, (U,))
+            (torch.int64, (n, 2)), (whole, (K,)), (torch.int64, (K,)), (real, (number, K)), (whole, (U,)), (real, (U,))
         ]  # fmt: skip
 
     def write(self, chosen: Chosen, own: OwnPart) -> None:
         """Write what windows say of chosen cells into this part."""
         self.tiles.copy_(chosen.tiles)
         self.cell.copy_(chosen.cell)
-        self.robot.copy_(chosen.place // own.windows.is_new[0].numel() + own.first)
+        torch.add(chosen.place, own.first, out=self.place)
         offers = own.offers
         for row, layer in zip(self.values, (*offers.heights, offers.relief, *(offers.contributed or ())), strict=True):
             torch.index_select(layer, 0, chosen.place, out=row)

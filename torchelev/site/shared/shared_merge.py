@@ -47,7 +47,8 @@ def merge_shared(
         cfg: settings.
         exchange: with other ranks.
     """
-    parts = _deal(windows, alignment, first, resolution, exchange)
+    size = windows.is_new[0].numel()
+    parts = _deal(windows, alignment, first * size, resolution, exchange)
     every = [part.chosen.tiles if isinstance(part, OwnPart) else part.tiles for part in parts]
     touched = torch.unique(torch.cat(every), dim=0)  # in ascending order
     groups = touched.split(GROUP) if len(touched) else ()
@@ -59,7 +60,7 @@ def merge_shared(
         layers = values.flatten(1)
         is_contradicted = fuse_entries(layers, join_entries([part.entries for part in said]), rate, cfg)
         lower_bounds(layers, torch.cat([part.bounded for part in said]), torch.cat([part.bound for part in said]))
-        robot = torch.cat([part.robot for part in said])[is_contradicted]
+        robot = torch.cat([part.place for part in said])[is_contradicted] // size
         return Merged(_as_tiles(group), values, torch.bincount(robot, minlength=num_robots))
 
     work = ((group, tiles.read(_as_tiles(group))) for group in groups)
