@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+import torch
 import torch.distributed as dist
 
 from tests.site import ranks
 from tests.site.ranks import run_ranks
 from torchelev.site import SiteMap
+from torchelev.site.shared.messages import make_messages, read_message
 from torchelev.site.shared.owners import owners_of
 
 SHARES = {
@@ -36,7 +38,10 @@ def assert_same(actual, expected):
 
 
 @pytest.mark.slow(3)
-@pytest.mark.parametrize(("size", "on_disk", "tilt"), [(2, True, False), (4, False, True), (8, True, False)])
+@pytest.mark.parametrize(
+    ("size", "on_disk", "tilt"),
+    [(2, True, True), (2, False, False), (4, False, True), (4, True, False), (8, True, False)],
+)
 def test_ranks_hold_what_one_process_with_all_robots_holds(size, on_disk, tilt, alone, tmp_path):
     path = tmp_path / "site" if on_disk else None
     results = results_of(run_ranks(ranks.fly, size, tmp_path / "ranks", path, SHARES[size], tilt))
@@ -51,6 +56,41 @@ def test_ranks_hold_what_one_process_with_all_robots_holds(size, on_disk, tilt, 
     if on_disk:
         with SiteMap.open(path) as site:
             assert_same(ranks.contents(site), contents)
+
+
+@pytest.mark.slow(1)
+def test_on_disk_a_rank_keeps_its_own_tiles_in_memory(tmp_path):
+    results = results_of(run_ranks(ranks.held, 2, tmp_path / "ranks", tmp_path / "site", SHARES[2]))
+    for rank, (tiles, size, time) in enumerate(results):
+        assert tiles and set(owners_of(tiles, 2)) == {rank}
+        assert len(tiles) < size and time == results[0][2]
+
+
+@pytest.mark.parametrize("size", [2, 3, 4, 8])
+def test_owners_share_areas_and_corridors(size):
+    area = [(x, y) for x in range(-80, 80) for y in range(-80, 80)]
+    owners = np.array(owners_of(area, size)).reshape(160, 160)
+    assert np.bincount(owners.ravel(), minlength=size) == pytest.approx(25600 / size, rel=0.02)
+    corridors = owners[7], owners[:, 12], owners.diagonal(), owners[:, ::-1].diagonal()
+    assert min(np.bincount(line, minlength=size).min() for line in corridors) >= 0.3 * 160 / size
+    assert owners_of([(3, -2), (2**40, -(2**40))], size) == owners_of([(3, -2), (2**40, -(2**40))], size)
+
+
+def test_messages_are_read_as_they_were_written():
+    tensors = [
+        torch.arange(6).view(3, 2),
+        torch.rand(3, 5),
+        torch.arange(3, dtype=torch.int32),
+        torch.zeros(0, 2, 2, 2),
+    ]
+    shapes = [(tensor.dtype, tuple(tensor.shape)) for tensor in tensors]
+    memory, lengths, written = make_messages([shapes, [], shapes[:3]], torch.device("cpu"))
+    for values in written:
+        for value, tensor in zip(values, tensors, strict=False):
+            value.copy_(tensor)
+    found = [read_message(message) for message in memory.split(lengths)]
+    assert [len(values) for values in found] == [4, 0, 3]
+    assert all(torch.equal(a, b) for values in found for a, b in zip(values, tensors, strict=False))
 
 
 @pytest.mark.slow(1)
@@ -104,6 +144,8 @@ EXPECTED = {
     "call": "call: must be the same on all ranks, got SiteMap on rank 0 and merge on rank 1",
     "disk": "cannot be written (No space left on device); all that was stored before is unchanged",
     "reading": f"rank {owners_of([(0, 0)], 2)[0]}: tile (0, 0): must be readable",
+    "beginning": "rank 0: _prepare must succeed",
+    "writing": f"rank {owners_of([(0, 0)], 2)[0]}: stage must succeed",
 }
 
 
