@@ -127,7 +127,7 @@ def fly(rank, path, shares, tilt):
 
 def held(rank, path, shares):
     """Merge and read everything; return the tiles in memory after the next merge, and the time of one that is read."""
-    site, emap, part = open_site(path), all_robots(), small_map(len(shares[rank]), (30, 26))
+    site, emap, part = SiteMap(0.1, path, group=dist.group.WORLD), all_robots(), small_map(len(shares[rank]), (30, 26))
     for step in range(2):
         measure(emap, step)
         take(part, emap, shares[rank])

@@ -10,6 +10,8 @@ from tests.site.ranks import run_ranks
 from torchelev.site import SiteMap
 from torchelev.site.shared.messages import make_messages, read_message
 from torchelev.site.shared.owners import owners_of
+from torchelev.site.shared.parts import cut_cells
+from torchelev.site.tiles import CELLS
 
 SHARES = {
     2: [[0], list(range(1, 11))],
@@ -91,6 +93,18 @@ def test_messages_are_read_as_they_were_written():
     found = [read_message(message) for message in memory.split(lengths)]
     assert [len(values) for values in found] == [4, 0, 3]
     assert all(torch.equal(a, b) for values in found for a, b in zip(values, tensors, strict=False))
+
+
+@pytest.mark.parametrize("tiles", [[(0, 0), (0, 2), (0, 3), (5, 1)], [(0, 2), (0, 3), (5, 1)], [(0, 0), (5, 1)]])
+def test_cells_get_the_numbers_of_a_group_of_tiles(tiles):
+    group, numbered = torch.tensor([(0, 1), (0, 2), (0, 3), (0, 4)]), torch.tensor(tiles)
+    cell = torch.tensor([CELLS * tile + k for tile in range(len(tiles)) for k in (0, 3, CELLS - 1)])
+    found, part = cut_cells(numbered, cell.int(), group)
+    named = [(*tiles[c // CELLS], c % CELLS) for c in cell.tolist()]
+    assert [(*group[c // CELLS].tolist(), c % CELLS) for c in found.tolist()] == named[part]
+    assert named[part] == [name for name in named if list(name[:2]) in group.tolist()]
+    gap, _ = cut_cells(torch.tensor([(0, 1), (0, 3)]), torch.tensor([5, CELLS + 7]), group)
+    assert gap.tolist() == [5, 2 * CELLS + 7]
 
 
 @pytest.mark.slow(1)

@@ -56,8 +56,8 @@ class OwnPart(NamedTuple):
     def at(self, group: Int[Tensor, "g 2"]) -> Said:
         """Return what it says of a group of tiles."""
         chosen = self.chosen
-        cell, part = _cut(chosen.tiles, chosen.cell, group)
-        bounded, bound_part = _cut(chosen.tiles, chosen.bounded, group)
+        cell, part = cut_cells(chosen.tiles, chosen.cell, group)
+        bounded, bound_part = cut_cells(chosen.tiles, chosen.bounded, group)
         place = chosen.place[part]
         bound = read_bounds(self.windows, self.alignment, chosen.bound_place[bound_part], self.resolution)
         return Said(self.offers.at(cell, place), place + self.first, bounded, bound)
@@ -81,8 +81,8 @@ class SentPart(NamedTuple):
 
     def at(self, group: Int[Tensor, "g 2"]) -> Said:
         """Return what it says of a group of tiles."""
-        cell, part = _cut(self.tiles, self.cell, group)
-        bounded, bound_part = _cut(self.tiles, self.bounded, group)
+        cell, part = cut_cells(self.tiles, self.cell, group)
+        bounded, bound_part = cut_cells(self.tiles, self.bounded, group)
         values = self.values[:, part]
         contributed = Heights(*values[4:]) if len(values) > 4 else None
         entries = Entries(cell, Heights(*values[:3]), values[3], contributed)
@@ -109,7 +109,7 @@ class SentPart(NamedTuple):
         self.bound.copy_(read_bounds(own.windows, own.alignment, chosen.bound_place, own.resolution))
 
 
-def _cut(tiles: Int[Tensor, "n 2"], cell: Tensor, group: Int[Tensor, "g 2"]) -> tuple[Int[Tensor, "k"], slice]:
+def cut_cells(tiles: Int[Tensor, "n 2"], cell: Tensor, group: Int[Tensor, "g 2"]) -> tuple[Int[Tensor, "k"], slice]:
     """Return the cells of a group of tiles, numbered in it, and where they are among all, in the order of tiles."""
     a, b = (tiles[:, None] == group).all(2).nonzero().unbind(1)  # both ascend: tiles of a group lie together
     if not len(a):
