@@ -291,9 +291,9 @@ class SiteMap(OpenedSite):
         if exchange.size > 1:
             first, number = sum(robots[: exchange.rank]), sum(robots)
             scale = self.resolution, rate, self.cfg
-            parts = merge_shared(self._tiles, windows, alignment, first, number, *scale, exchange)
-            parts = parts if self._store else gather_tiles(parts, exchange)
-            contradictions = exchange.sum(self._write(parts, time, number))
+            own = merge_shared(self._tiles, windows, alignment, first, number, *scale, exchange)
+            every = own if self._store else gather_tiles(own, exchange)
+            contradictions = exchange.sum(self._write(every, time, number))
             return contradictions[first : first + robots[exchange.rank]]
         if self._keyframes is None or new is None:
             parts = merge_windows(self._tiles, windows, alignment, self.resolution, rate, self.cfg, changes, surfaces)

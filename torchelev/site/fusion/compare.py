@@ -57,7 +57,8 @@ class Pairs(NamedTuple):
     def select(self, chosen: Int[Tensor, "p"]) -> Pairs:
         """Return some of them, by number."""
         position = None if self.position is None else self.position.index_select(1, chosen)
-        return Pairs(*(value.index_select(0, chosen) for value in self[:4]), position)
+        first, second, difference, variance = (value.index_select(0, chosen) for value in self[:4])
+        return Pairs(first, second, difference, variance, position)
 
 
 def gather_robots(windows: Windows, exchange: Exchange) -> Robots:
