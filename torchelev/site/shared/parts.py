@@ -70,11 +70,11 @@ def read_bounds(windows: Windows, alignment: Alignment, place: Tensor, resolutio
 
 
 class SentPart(NamedTuple):
-    """What another rank's windows say of tiles: 28 bytes for each cell that is new, 40 once a robot has contributed."""
+    """What another rank's windows say of tiles: 24 bytes for each cell that is new, 36 once a robot has contributed."""
 
     tiles: Int[Tensor, "n 2"]  #: in ascending order
     cell: Int[Tensor, "K"]  #: number of the tile * CELLS + number of the cell, by tiles, int32
-    place: Int[Tensor, "K"]  #: in the flat windows of all ranks
+    place: Int[Tensor, "K"]  #: in the flat windows of all ranks, int32
     values: Float[Tensor, "v K"]  #: elevation, variance, time, relief, and, if a robot has contributed, these 3 again
     bounded: Int[Tensor, "U"]  #: cells that have an upper bound, by tiles, int32
     bound: Float[Tensor, "U"]  #: [m] in the site's frame
@@ -86,7 +86,7 @@ class SentPart(NamedTuple):
         values = self.values[:, part]
         contributed = Heights(*values[4:]) if len(values) > 4 else None
         entries = Entries(cell, Heights(*values[:3]), values[3], contributed)
-        return Said(entries, self.place[part], bounded, self.bound[bound_part])
+        return Said(entries, self.place[part].long(), bounded, self.bound[bound_part])
 
     @staticmethod
     def shapes(chosen: Chosen, number: int) -> list[Shape]:
@@ -94,14 +94,14 @@ class SentPart(NamedTuple):
         n, K, U = len(chosen.tiles), len(chosen.cell), len(chosen.bounded)
         whole, real = torch.int32, torch.float32
         return [
-            (torch.int64, (n, 2)), (whole, (K,)), (torch.int64, (K,)), (real, (number, K)), (whole, (U,)), (real, (U,))
+            (torch.int64, (n, 2)), (whole, (K,)), (whole, (K,)), (real, (number, K)), (whole, (U,)), (real, (U,))
         ]  # fmt: skip
 
     def write(self, chosen: Chosen, own: OwnPart) -> None:
         """Write what windows say of chosen cells into this part."""
         self.tiles.copy_(chosen.tiles)
         self.cell.copy_(chosen.cell)
-        torch.add(chosen.place, own.first, out=self.place)
+        self.place.copy_(chosen.place).add_(own.first)
         offers = own.offers
         for row, layer in zip(self.values, (*offers.heights, offers.relief, *(offers.contributed or ())), strict=True):
             torch.index_select(layer, 0, chosen.place, out=row)
