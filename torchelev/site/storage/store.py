@@ -20,6 +20,8 @@ from torchelev.site.storage.tile_files import Tile, TileFiles, as_tiles
 from torchelev.site.storage.transaction import CommitError, clean, finish, lock_folder, stage
 from torchelev.site.storage.zarr_files import METADATA, encode_metadata, import_tensorstore, wait_for
 
+_MAX_WRITES = 32  # tiles that are written at a time
+
 
 class TileStore:
     """A folder of square tiles of layers, to which one process writes while others read.
@@ -195,6 +197,7 @@ class TileStore:
                     pairs, cells = self._check(tiles, values)
                     writes.extend(self._files.stage(pairs, cells))
                     written.update(pairs)
+                    _wait_for_older(writes)
 
                 try:
                     yield write
@@ -218,6 +221,7 @@ class TileStore:
 
         def write(tiles: Sequence[Tile] | NDArray, values: ArrayLike) -> None:
             writes.extend(self._files.stage(*self._check(tiles, values)))
+            _wait_for_older(writes)
 
         try:
             yield write
@@ -265,6 +269,13 @@ class TileStore:
         if clean(self.path):
             self.refresh()
         named_arrays.check_names(self.path, names)
+
+
+def _wait_for_older(writes: list[Any]) -> None:
+    """Wait until few enough of the writes are left, as their tiles stay in memory."""
+    done = max(0, len(writes) - _MAX_WRITES)
+    wait_for(writes[:done])
+    del writes[:done]
 
 
 def _size(file: Path) -> int:
