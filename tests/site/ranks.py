@@ -16,7 +16,6 @@ from tests.helpers import small_map
 from tests.site.helpers import fill, live
 from torchelev.site import LostRankError, SiteConfig, SiteMap
 from torchelev.site.reading import LAYERS
-from torchelev.site.shared.owners import owners_of
 
 NUM_ROBOTS = 11
 CORNERS = [(0, 0), (12, -9), (20, 25), (-30, 6), (8, 20), (45, 30), (160, 0), (170, 8), (-8, -20), (25, 5), (-99, 70)]
@@ -126,15 +125,15 @@ def fly(rank, path, shares, tilt):
 
 
 def held(rank, path, shares):
-    """Merge and read everything; return the tiles in memory after the next merge, and the time of one that is read."""
+    """Merge and read everything; return which tiles in memory are others' after the next merge, and the time of one."""
     site, emap, part = SiteMap(0.1, path, group=dist.group.WORLD), all_robots(), small_map(len(shares[rank]), (30, 26))
     for step in range(2):
         measure(emap, step)
         take(part, emap, shares[rank])
         site.merge(part)
-        tiles, size = list(site._tiles._slots), len(site)
+        kept, size = site._are_of_others(list(site._tiles._slots)), len(site)
         contents(site)
-    return tiles, size, float(site.sample(torch.tensor([[1.0, 1.0]]), "time", "nearest")[0])
+    return kept, size, float(site.sample(torch.tensor([[1.0, 1.0]]), "time", "nearest")[0])
 
 
 def one_robot(rank, step=0):
@@ -220,7 +219,7 @@ def misuse(rank, path, other):
         "disk": lambda: _with_full_disk(merge),
         "reading": lambda: _unreadable(site, merge, rank),
         "beginning": lambda: _failing(site._store, "_prepare", merge, rank == 0),
-        "writing": lambda: _failing(site._store._files, "stage", merge, rank == owners_of([(0, 0)], 2)[0]),
+        "writing": lambda: _failing(site._store._files, "stage", merge, rank == 1),
     }
     texts |= {name: _error_of(call) for name, call in cases.items()}
     after = contents(site)
@@ -263,7 +262,7 @@ def _unreadable(site, merge, rank):
         raise ValueError("tile (0, 0): must be readable")
 
     read = site._tiles.read
-    site._tiles.read = fail if rank == owners_of([(0, 0)], 2)[0] else read
+    site._tiles.read = fail if rank else read
     try:
         merge()
     finally:

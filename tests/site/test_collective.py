@@ -9,7 +9,7 @@ from tests.site import ranks
 from tests.site.ranks import run_ranks
 from torchelev.site import SiteMap
 from torchelev.site.shared.messages import make_messages, read_message
-from torchelev.site.shared.owners import owners_of
+from torchelev.site.shared.owners import find_owners, number_along_curve, split_curve
 from torchelev.site.shared.parts import cut_cells
 from torchelev.site.tiles import CELLS
 
@@ -63,19 +63,29 @@ def test_ranks_hold_what_one_process_with_all_robots_holds(size, on_disk, tilt, 
 @pytest.mark.slow(1)
 def test_on_disk_a_rank_keeps_its_own_tiles_in_memory(tmp_path):
     results = results_of(run_ranks(ranks.held, 2, tmp_path / "ranks", tmp_path / "site", SHARES[2]))
-    for rank, (tiles, size, time) in enumerate(results):
-        assert tiles and set(owners_of(tiles, 2)) == {rank}
-        assert len(tiles) < size and time == results[0][2]
+    for are_of_others, size, time in results:
+        assert 0 < len(are_of_others) < size and not any(are_of_others)
+        assert time == results[0][2]
+
+
+def test_neighbours_along_the_curve_of_tiles_are_neighbours():
+    x, y = (value.flatten() for value in torch.meshgrid(torch.arange(-16, 16), torch.arange(-16, 16), indexing="ij"))
+    number = number_along_curve(x, y)
+    assert len(number.unique()) == 32 * 32
+    for quadrant in ((x < 0) & (y < 0), (x < 0) & (y >= 0), (x >= 0) & (y < 0), (x >= 0) & (y >= 0)):
+        along, order = number[quadrant].sort()
+        assert (along.diff() == 1).all()
+        steps = [value[quadrant][order].diff().abs() for value in (x, y)]
+        assert (steps[0] + steps[1] == 1).all()
 
 
 @pytest.mark.parametrize("size", [2, 3, 4, 8])
-def test_owners_share_areas_and_corridors(size):
-    area = [(x, y) for x in range(-80, 80) for y in range(-80, 80)]
-    owners = np.array(owners_of(area, size)).reshape(160, 160)
-    assert np.bincount(owners.ravel(), minlength=size) == pytest.approx(25600 / size, rel=0.02)
-    corridors = owners[7], owners[:, 12], owners.diagonal(), owners[:, ::-1].diagonal()
-    assert min(np.bincount(line, minlength=size).min() for line in corridors) >= 0.3 * 160 / size
-    assert owners_of([(3, -2), (2**40, -(2**40))], size) == owners_of([(3, -2), (2**40, -(2**40))], size)
+def test_owners_share_the_windows(size):
+    windows = torch.randint(-40, 40, (480, 2), generator=torch.Generator().manual_seed(size))
+    number = number_along_curve(*windows.unbind(1))
+    owners = find_owners(number, split_curve(number, size))
+    assert torch.bincount(owners, minlength=size).tolist() == pytest.approx([480 / size] * size, abs=4)
+    assert find_owners(torch.tensor([-1, 1 << 61]), split_curve(number, size)).tolist() == [0, size - 1]
 
 
 def test_messages_are_read_as_they_were_written():
@@ -157,9 +167,9 @@ EXPECTED = {
     "given": "time: must be the same on all ranks, got not given on rank 0 and given on rank 1",
     "call": "call: must be the same on all ranks, got SiteMap on rank 0 and merge on rank 1",
     "disk": "cannot be written (No space left on device); all that was stored before is unchanged",
-    "reading": f"rank {owners_of([(0, 0)], 2)[0]}: tile (0, 0): must be readable",
+    "reading": "rank 1: tile (0, 0): must be readable",
     "beginning": "rank 0: _prepare must succeed",
-    "writing": f"rank {owners_of([(0, 0)], 2)[0]}: stage must succeed",
+    "writing": "rank 1: stage must succeed",
 }
 
 

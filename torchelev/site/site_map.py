@@ -76,8 +76,8 @@ class SiteMap(OpenedSite):
     completely or not at all, and memory does not grow with the area.
 
     With a `group`, all its ranks hold one site, and `merge` takes the robots of all of them, in the order of the ranks:
-    call it on all ranks, which wait for each other. Reading is up to each rank. On disk, rank 0 writes, and the others
-    read the same folder. See `torchelev.site.shared.collective`.
+    call it on all ranks, which wait for each other and share the work. Reading is up to each rank. On disk, all ranks
+    write to one folder, which all must see, and rank 0 commits. See `torchelev.site.shared.collective`.
 
     Args:
         resolution: [m] of the cells, as of the maps that are merged.
@@ -184,6 +184,7 @@ class SiteMap(OpenedSite):
         now = now if time is None else self._since_epoch(now)
         state = self._bring(emap)
         windows = read_windows(emap, state, now, contribution)
+        self._exchange.split(windows.known.corner, windows.is_new.shape[1:])
         alignment = self._align(windows, align, tilt)
         new = self._record(windows, alignment, T_map_base, now)
         keyframes = torch.full_like(state.elapsed, -1) if new is None else new.ids
@@ -231,7 +232,6 @@ class SiteMap(OpenedSite):
         return {
             "same": same,
             "robots": emap.num_envs,
-            "contributed": contribution is not None,
             "now": now,
             "rate": rate,
         }

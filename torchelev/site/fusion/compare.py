@@ -12,7 +12,7 @@ from torch import Tensor
 from torchelev.site.fusion.exchange import ALONE, Exchange
 from torchelev.site.fusion.windows import Windows
 from torchelev.site.site_config import SiteConfig
-from torchelev.site.tiles import TILE
+from torchelev.site.tiles import TILE, locate_tiles
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -151,7 +151,9 @@ def _deal(compared: Compared, robots: Robots, size: tuple[int, ...], exchange: E
 
     def send() -> tuple[Tensor, list[int]]:
         x, y = _lattice(compared, robots, size)
-        owner = exchange.find_owners(x // TILE, y // TILE)
+        tiles, number = locate_tiles(x // TILE, y // TILE)
+        own = torch.tensor(tiles, dtype=torch.int64, device=x.device).view(-1, 2)
+        owner = exchange.find_owners(*own.unbind(1)).index_select(0, number)
         chosen = [(owner == rank).nonzero()[:, 0] for rank in range(exchange.size)]
         parts = [torch.stack([*map(_as_int32, compared.select(its))]).view(-1) for its in chosen]
         return torch.cat(parts).view(torch.uint8), [_BYTES * len(its) for its in chosen]

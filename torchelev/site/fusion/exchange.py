@@ -41,6 +41,9 @@ class Exchange:
         memory, lengths = make()
         return [memory], sum(lengths)
 
+    def split(self, corner: Int[Tensor, "B 2"], size: Sequence[int]) -> None:
+        """Share out the tiles for a merge of windows of this size [cells], whose first cells these are."""
+
     def find_owners(self, x: Int[Tensor, "K"], y: Int[Tensor, "K"]) -> Int[Tensor, "K"]:
         """Return the ranks that fuse the tiles with numbers x, y."""
         return torch.zeros_like(x)

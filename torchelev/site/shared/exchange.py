@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
+import torch
 from torch import Tensor
 
 from torchelev.site.fusion.exchange import ALONE, Exchange
-from torchelev.site.shared.owners import find_owners
+from torchelev.site.shared.owners import find_owners, number_along_curve, split_curve
 from torchelev.site.shared.ranks import Ranks
+from torchelev.site.tiles import TILE
 
 if TYPE_CHECKING:
     from jaxtyping import Int, UInt8
@@ -26,6 +28,7 @@ class RankExchange(Exchange):
 
     def __init__(self, ranks: Ranks) -> None:
         self._ranks, self.rank, self.size = ranks, ranks.rank, ranks.size
+        self._begins = torch.zeros(ranks.size - 1, dtype=torch.int64)
 
     def gather(self, make: Callable[[], Tensor]) -> list[Tensor]:
         """Return the rows that `make` returns on each rank."""
@@ -61,9 +64,15 @@ class RankExchange(Exchange):
         messages = self._ranks.all_to_all(_CALL, made[0], sizes[self.rank], received)
         return list(messages.split(received)), sum(map(sum, sizes))
 
+    def split(self, corner: Int[Tensor, "B 2"], size: Sequence[int]) -> None:
+        """Share out the tiles, so that as many windows have their centre in those of each rank."""
+        tile = (corner + torch.tensor(size, device=corner.device) // 2) // TILE
+        numbers = number_along_curve(*tile.unbind(1))
+        self._begins = split_curve(torch.cat(self.gather(lambda: numbers)), self.size)
+
     def find_owners(self, x: Int[Tensor, "K"], y: Int[Tensor, "K"]) -> Int[Tensor, "K"]:
         """Return the ranks that fuse the tiles with numbers x, y."""
-        return find_owners(x, y, self.size)
+        return find_owners(number_along_curve(x, y), self._begins)
 
 
 def exchange_of(ranks: Ranks) -> Exchange:
