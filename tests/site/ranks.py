@@ -205,7 +205,7 @@ def misuse(rank, path, other):
         "site's resolution": lambda: SiteMap(0.2, path, group=dist.group.WORLD),
     }
     texts = {name: _error_of(call) for name, call in cases.items()}
-    site, emap = open_site(path), one_robot(rank)
+    site, emap = open_site(path), one_robot(rank, step=2 * rank)  # so that each rank has a tile
     before = contents(site)
     merge = functools.partial(site.merge, emap)
     cases = {

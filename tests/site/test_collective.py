@@ -9,7 +9,7 @@ from tests.site import ranks
 from tests.site.ranks import run_ranks
 from torchelev.site import SiteMap
 from torchelev.site.shared.messages import make_messages, read_message
-from torchelev.site.shared.owners import find_owners, number_along_curve, split_curve
+from torchelev.site.shared.owners import number_along_curve, share_out
 from torchelev.site.shared.parts import cut_cells
 from torchelev.site.tiles import CELLS
 
@@ -81,11 +81,23 @@ def test_neighbours_along_the_curve_of_tiles_are_neighbours():
 
 @pytest.mark.parametrize("size", [2, 3, 4, 8])
 def test_owners_share_the_windows(size):
-    windows = torch.randint(-40, 40, (480, 2), generator=torch.Generator().manual_seed(size))
-    number = number_along_curve(*windows.unbind(1))
-    owners = find_owners(number, split_curve(number, size))
-    assert torch.bincount(owners, minlength=size).tolist() == pytest.approx([480 / size] * size, abs=4)
-    assert find_owners(torch.tensor([-1, 1 << 61]), split_curve(number, size)).tolist() == [0, size - 1]
+    generator = torch.Generator().manual_seed(size)
+    windows = [torch.randint(-40, 40, (480 // size, 2), generator=generator) for _ in range(size)]
+    owners = share_out(windows)
+    found = owners.find(*torch.cat(windows).unbind(1))
+    assert torch.bincount(found, minlength=size).tolist() == pytest.approx([480 / size] * size, abs=4)
+    assert sorted(owners.rank.tolist()) == list(range(size))
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("direction", [1, -1])
+def test_ranks_own_the_tiles_below_their_robots(axis, direction):
+    x, y = (value.flatten() for value in torch.meshgrid(torch.arange(16), torch.arange(16), indexing="ij"))
+    order = (direction * torch.stack([x, y])[axis]).sort(stable=True).indices
+    windows = [torch.stack([x, y], 1)[part] for part in order.split(128)]
+    owners = share_out(windows)
+    for rank, tiles in enumerate(windows):
+        assert (owners.find(*tiles.unbind(1)) == rank).all()
 
 
 def test_messages_are_read_as_they_were_written():

@@ -11,8 +11,8 @@ A merge of R ranks takes these steps, of which those marked * wait for all ranks
 6. * on disk: rank 0 has committed. What a rank reads from now on is as of this merge.
 
 The result is that of one process up to the rounding of offsets, whatever the number of ranks. Each rank owns a stretch
-of a space-filling curve, in which as many windows have their centres, see `owners`: robots that are near each other and
-on one rank send little. Owners change with the windows, as any rank can read any tile.
+of a space-filling curve, in which as many windows have their centres, of its own where possible, see `owners`: robots
+that are near each other and on one rank send little. Owners change with the windows, as any rank can read any tile.
 
 Ranks read without each other, also after one of them is lost. So in memory each one holds the whole site, 28 bytes for
 each cell of a tile, and what falls with the number of ranks is the memory of a merge and of the maps. On disk each one

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchelev.site.fusion.exchange import ALONE, Exchange
-from torchelev.site.shared.owners import find_owners, number_along_curve, split_curve
+from torchelev.site.shared.owners import Owners, share_out
 from torchelev.site.shared.ranks import Ranks
 from torchelev.site.tiles import TILE
 
@@ -28,7 +28,7 @@ class RankExchange(Exchange):
 
     def __init__(self, ranks: Ranks) -> None:
         self._ranks, self.rank, self.size = ranks, ranks.rank, ranks.size
-        self._begins = torch.zeros(ranks.size - 1, dtype=torch.int64)
+        self._owners: Owners | None = None
 
     def gather(self, make: Callable[[], Tensor]) -> list[Tensor]:
         """Return the rows that `make` returns on each rank."""
@@ -66,13 +66,13 @@ class RankExchange(Exchange):
 
     def split(self, corner: Int[Tensor, "B 2"], size: Sequence[int]) -> None:
         """Share out the tiles, so that as many windows have their centre in those of each rank."""
-        tile = (corner + torch.tensor(size, device=corner.device) // 2) // TILE
-        numbers = number_along_curve(*tile.unbind(1))
-        self._begins = split_curve(torch.cat(self.gather(lambda: numbers)), self.size)
+        tiles = (corner + torch.tensor(size, device=corner.device) // 2) // TILE
+        self._owners = share_out(self.gather(lambda: tiles))
 
     def find_owners(self, x: Int[Tensor, "K"], y: Int[Tensor, "K"]) -> Int[Tensor, "K"]:
         """Return the ranks that fuse the tiles with numbers x, y."""
-        return find_owners(number_along_curve(x, y), self._begins)
+        assert self._owners is not None
+        return self._owners.find(x, y)
 
 
 def exchange_of(ranks: Ranks) -> Exchange:
