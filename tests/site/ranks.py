@@ -125,6 +125,18 @@ def fly(rank, path, shares, tilt):
     return mission(open_site(path), shares[rank], tilt)
 
 
+def held(rank, path, shares):
+    """Merge and read everything; return which tiles in memory are others' after the next merge, and the time of one."""
+    site, emap, part = SiteMap(0.1, path, group=dist.group.WORLD), all_robots(), small_map(len(shares[rank]), (30, 26))
+    for step in range(2):
+        measure(emap, step)
+        take(part, emap, shares[rank])
+        site.merge(part)
+        kept, size = site._are_of_others(list(site._tiles._slots)), len(site)
+        contents(site)
+    return kept, size, float(site.sample(torch.tensor([[1.0, 1.0]]), "time", "nearest")[0])
+
+
 def one_robot(rank, step=0):
     emap = small_map(1, (30, 26))
     return fill(emap, [(40 * step + 10 * rank, 0)], lambda x, y: 0.1 * x + step)
@@ -190,7 +202,7 @@ def misuse(rank, path, other):
         "site's resolution": lambda: SiteMap(0.2, path, group=dist.group.WORLD),
     }
     texts = {name: _error_of(call) for name, call in cases.items()}
-    site, emap = open_site(path), one_robot(rank)
+    site, emap = open_site(path), one_robot(rank, step=2 * rank)  # so that each rank has a tile
     before = contents(site)
     merge = functools.partial(site.merge, emap)
     cases = {
@@ -203,6 +215,8 @@ def misuse(rank, path, other):
         "call": lambda: merge() if rank else SiteMap(group=dist.group.WORLD),
         "disk": lambda: _with_full_disk(merge),
         "reading": lambda: _unreadable(site, merge, rank),
+        "beginning": lambda: _failing(site._store, "_alone", merge, rank == 0),
+        "writing": lambda: _failing(site._store, "_writer", merge, rank == 1),
     }
     texts |= {name: _error_of(call) for name, call in cases.items()}
     after = contents(site)
@@ -228,6 +242,18 @@ def _with_full_disk(merge):
         merge()
     finally:
         store.commit = commit
+
+
+def _failing(thing, name, merge, is_failing):
+    def fail(*args):
+        raise ValueError(f"{name} must succeed")
+
+    original = getattr(thing, name)
+    setattr(thing, name, fail if is_failing else original)
+    try:
+        merge()
+    finally:
+        setattr(thing, name, original)
 
 
 def _unreadable(site, merge, rank):

@@ -8,7 +8,9 @@ import torch
 
 from tests.site.helpers import fill, ground, robots
 from torchelev.site import SiteConfig, SiteMap
-from torchelev.site.fusion.align import find_groups
+from torchelev.site.fusion import normal_equations
+from torchelev.site.fusion.align import find_groups, find_median
+from torchelev.site.fusion.exchange import ALONE
 
 
 def grid_of(number, spacing=24):
@@ -113,6 +115,40 @@ def test_groups_are_those_of_a_search(seed):
             queue += new
         expected[start] = min(seen)
     assert find_groups(overlap).tolist() == expected
+
+
+@pytest.mark.parametrize("size", [1, 3])
+@pytest.mark.parametrize("anchored", [False, True])
+def test_iterations_and_a_factorisation_solve_the_same_equations(size, anchored, monkeypatch):
+    generator, M = torch.Generator().manual_seed(size), 41
+    overlap = torch.zeros(M, M, dtype=torch.bool)
+    for k in range(39):  # a ring without one window, and the last one is the site
+        overlap[k, (k + 1) % 39] = overlap[k, (k + 4) % 39] = True
+    overlap[3, M - 1] = anchored
+    overlap = overlap | overlap.T
+    ends = overlap.triu(1).nonzero()
+    columns = torch.randn(len(ends), 30, 6 if size == 3 else 2, dtype=torch.float64, generator=generator)
+    columns[..., 0] = 1.0
+    moments = 1e3 * (columns[..., :-1].transpose(1, 2) @ columns)
+    groups, before = find_groups(overlap), torch.full((M - 1,), torch.nan, dtype=torch.float64)
+    before[[2, 7]] = torch.tensor([0.3, 0.1], dtype=torch.float64)
+    found = []
+    for dense in (1000, 0):
+        monkeypatch.setattr(normal_equations, "_DENSE", dense)
+        monkeypatch.setattr(normal_equations, "_factorise", normal_equations._factorise if dense else None)
+        edges, start = normal_equations.Edges(ends, M), torch.zeros(M, size, dtype=torch.float64)
+        found.append(normal_equations.solve(edges, moments, groups, before, start))
+    torch.testing.assert_close(found[0], found[1], rtol=0.0, atol=1e-9)
+    assert not found[1][-1].any()
+    if not anchored:
+        assert float(found[1][[2, 7], 0].mean()) == pytest.approx(0.2, abs=1e-9)
+
+
+@pytest.mark.parametrize("number", [1, 2, 100, 10_001])
+def test_medians_are_found_by_counting(number):
+    values = 0.02 * torch.randn(number, dtype=torch.float64, generator=torch.Generator().manual_seed(number))
+    assert find_median(values, number, ALONE) == pytest.approx(float(values.abs().median()), rel=1e-3)
+    assert find_median(0.0 * values, number, ALONE) == 0.0
 
 
 def test_the_overlap_must_be_large_enough():

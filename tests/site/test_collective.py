@@ -8,8 +8,10 @@ import torch.distributed as dist
 from tests.site import ranks
 from tests.site.ranks import run_ranks
 from torchelev.site import SiteMap
-from torchelev.site.fusion.windows import Alignment, Windows, read_windows, snapshot
-from torchelev.site.shared.packing import Layout, pack, unpack
+from torchelev.site.shared.messages import make_messages, read_message
+from torchelev.site.shared.owners import number_along_curve, share_out
+from torchelev.site.shared.parts import cut_cells
+from torchelev.site.tiles import CELLS
 
 SHARES = {
     2: [[0], list(range(1, 11))],
@@ -38,7 +40,10 @@ def assert_same(actual, expected):
 
 
 @pytest.mark.slow(3)
-@pytest.mark.parametrize(("size", "on_disk", "tilt"), [(2, True, False), (4, False, True), (8, True, False)])
+@pytest.mark.parametrize(
+    ("size", "on_disk", "tilt"),
+    [(2, True, True), (2, False, False), (4, False, True), (4, True, False), (8, True, False)],
+)
 def test_ranks_hold_what_one_process_with_all_robots_holds(size, on_disk, tilt, alone, tmp_path):
     path = tmp_path / "site" if on_disk else None
     results = results_of(run_ranks(ranks.fly, size, tmp_path / "ranks", path, SHARES[size], tilt))
@@ -53,6 +58,75 @@ def test_ranks_hold_what_one_process_with_all_robots_holds(size, on_disk, tilt, 
     if on_disk:
         with SiteMap.open(path) as site:
             assert_same(ranks.contents(site), contents)
+
+
+@pytest.mark.slow(1)
+def test_on_disk_a_rank_keeps_its_own_tiles_in_memory(tmp_path):
+    results = results_of(run_ranks(ranks.held, 2, tmp_path / "ranks", tmp_path / "site", SHARES[2]))
+    for are_of_others, size, time in results:
+        assert 0 < len(are_of_others) < size and not any(are_of_others)
+        assert time == results[0][2]
+
+
+def test_neighbours_along_the_curve_of_tiles_are_neighbours():
+    x, y = (value.flatten() for value in torch.meshgrid(torch.arange(-16, 16), torch.arange(-16, 16), indexing="ij"))
+    number = number_along_curve(x, y)
+    assert len(number.unique()) == 32 * 32
+    for quadrant in ((x < 0) & (y < 0), (x < 0) & (y >= 0), (x >= 0) & (y < 0), (x >= 0) & (y >= 0)):
+        along, order = number[quadrant].sort()
+        assert (along.diff() == 1).all()
+        steps = [value[quadrant][order].diff().abs() for value in (x, y)]
+        assert (steps[0] + steps[1] == 1).all()
+
+
+@pytest.mark.parametrize("size", [2, 3, 4, 8])
+def test_owners_share_the_windows(size):
+    generator = torch.Generator().manual_seed(size)
+    windows = [torch.randint(-40, 40, (480 // size, 2), generator=generator) for _ in range(size)]
+    owners = share_out(windows)
+    found = owners.find(*torch.cat(windows).unbind(1))
+    assert torch.bincount(found, minlength=size).tolist() == pytest.approx([480 / size] * size, abs=4)
+    assert sorted(owners.rank.tolist()) == list(range(size))
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("direction", [1, -1])
+def test_ranks_own_the_tiles_below_their_robots(axis, direction):
+    x, y = (value.flatten() for value in torch.meshgrid(torch.arange(16), torch.arange(16), indexing="ij"))
+    order = (direction * torch.stack([x, y])[axis]).sort(stable=True).indices
+    windows = [torch.stack([x, y], 1)[part] for part in order.split(128)]
+    owners = share_out(windows)
+    for rank, tiles in enumerate(windows):
+        assert (owners.find(*tiles.unbind(1)) == rank).all()
+
+
+def test_messages_are_read_as_they_were_written():
+    tensors = [
+        torch.arange(6).view(3, 2),
+        torch.rand(3, 5),
+        torch.arange(3, dtype=torch.int32),
+        torch.zeros(0, 2, 2, 2),
+    ]
+    shapes = [(tensor.dtype, tuple(tensor.shape)) for tensor in tensors]
+    memory, lengths, written = make_messages([shapes, [], shapes[:3]], torch.device("cpu"))
+    for values in written:
+        for value, tensor in zip(values, tensors, strict=False):
+            value.copy_(tensor)
+    found = [read_message(message) for message in memory.split(lengths)]
+    assert [len(values) for values in found] == [4, 0, 3]
+    assert all(torch.equal(a, b) for values in found for a, b in zip(values, tensors, strict=False))
+
+
+@pytest.mark.parametrize("tiles", [[(0, 0), (0, 2), (0, 3), (5, 1)], [(0, 2), (0, 3), (5, 1)], [(0, 0), (5, 1)]])
+def test_cells_get_the_numbers_of_a_group_of_tiles(tiles):
+    group, numbered = torch.tensor([(0, 1), (0, 2), (0, 3), (0, 4)]), torch.tensor(tiles)
+    cell = torch.tensor([CELLS * tile + k for tile in range(len(tiles)) for k in (0, 3, CELLS - 1)])
+    found, part = cut_cells(numbered, cell.int(), group)
+    named = [(*tiles[c // CELLS], c % CELLS) for c in cell.tolist()]
+    assert [(*group[c // CELLS].tolist(), c % CELLS) for c in found.tolist()] == named[part]
+    assert named[part] == [name for name in named if list(name[:2]) in group.tolist()]
+    gap, _ = cut_cells(torch.tensor([(0, 1), (0, 3)]), torch.tensor([5, CELLS + 7]), group)
+    assert gap.tolist() == [5, 2 * CELLS + 7]
 
 
 @pytest.mark.slow(1)
@@ -106,6 +180,8 @@ EXPECTED = {
     "call": "call: must be the same on all ranks, got SiteMap on rank 0 and merge on rank 1",
     "disk": "cannot be used (the disk is full); all that was stored before is unchanged",
     "reading": "rank 1: tile (0, 0): must be readable",
+    "beginning": "rank 0: _alone must succeed",
+    "writing": "rank 1: _writer must succeed",
 }
 
 
@@ -127,46 +203,3 @@ def test_a_group_that_is_not_initialised_is_refused():
     assert not dist.is_initialized()
     with pytest.raises(ValueError, match="group: must be initialised, got none; call torch.distributed"):
         SiteMap(0.1, group=object())
-
-
-@pytest.mark.parametrize("with_contribution", [False, True])
-def test_packed_windows_are_exact_and_as_large_as_documented(with_contribution):
-    emap = ranks.all_robots()
-    emap.corner.copy_(emap.corner + 2**40)
-    ranks.measure(emap, 1)
-    emap.corner.add_(2**40)
-    windows = read_windows(emap, emap.state, 1e9 + 1e-7, None)
-    contribution = (
-        snapshot(emap, windows, ranks_alignment(emap), emap.state.elapsed, emap.num_resets - 1)
-        if with_contribution
-        else None
-    )
-    windows, layout = windows._replace(contribution=contribution), Layout(30, 26, with_contribution)
-    rows = pack(windows, layout)
-    assert rows.shape == (ranks.NUM_ROBOTS, layout.num_bytes)
-    assert layout.num_bytes == pytest.approx(
-        30 * 26 * (32.625 if with_contribution else 20.5) + (88 if with_contribution else 32), abs=4
-    )
-    assert_equal(windows, unpack(rows, layout))
-
-
-def ranks_alignment(emap):
-    generator = torch.Generator().manual_seed(0)
-    shifts = torch.rand(emap.num_envs, 3, dtype=torch.float64, generator=generator)
-    return Alignment(shifts[:, 0], shifts[:, 1:], torch.zeros(emap.num_envs, dtype=torch.bool))
-
-
-def assert_equal(windows, found):
-    """All bits that a merge reads are the same."""
-    mine, theirs = windows.known, found.known
-    for name in ("corner", "now", "rate", "is_known", "variance", "age"):
-        assert torch.equal(getattr(mine, name), getattr(theirs, name)), name
-    assert torch.equal(mine.elevation[mine.is_known], theirs.elevation[mine.is_known])
-    assert torch.equal(windows.upper_bound[windows.is_bounded], found.upper_bound[windows.is_bounded])
-    for name in Windows._fields[1:4] + Windows._fields[5:7]:
-        assert torch.equal(getattr(windows, name), getattr(found, name)), name
-    assert (windows.contribution is None) == (found.contribution is None)
-    if windows.contribution is not None:
-        pairs = [*zip(windows.contribution.known, found.contribution.known, strict=True)]
-        pairs += zip(windows.contribution.alignment, found.contribution.alignment, strict=True)
-        assert all(torch.equal(a, b) for a, b in pairs)

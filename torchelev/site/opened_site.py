@@ -13,16 +13,18 @@ import torch
 from torchelev.errors import require, require_positive
 from torchelev.inputs import checks
 from torchelev.site.channels import SiteChannels
+from torchelev.site.fusion.exchange import Exchange
 from torchelev.site.fusion.merge import Merged
 from torchelev.site.keyframes.keyframe_log import Arrays, KeyframeLog
 from torchelev.site.readable_site import ReadableSite
 from torchelev.site.shared.collective import shared_transaction
+from torchelev.site.shared.exchange import exchange_of
 from torchelev.site.shared.ranks import Ranks
 from torchelev.site.site_config import SiteConfig
 from torchelev.site.site_levels import SiteLevels
 from torchelev.site.storage.engines import open_store
 from torchelev.site.storage.interface import Note
-from torchelev.site.tiles import LAYERS, Tiles
+from torchelev.site.tiles import LAYERS, Tile, Tiles
 
 if TYPE_CHECKING:
     from jaxtyping import Int
@@ -35,6 +37,7 @@ class OpenedSite(ReadableSite):
 
     cfg: SiteConfig
     _ranks: Ranks
+    _exchange: Exchange
     _keyframes: KeyframeLog | None
     _id: str
     _opened: float
@@ -84,6 +87,7 @@ class OpenedSite(ReadableSite):
             channels = SiteChannels(self._store.attributes.get("channels"), LAYERS, self._store.layers)
             levels = SiteLevels.of(self._store.attributes)
         self._tiles = Tiles(self._store, self.cfg.cache_tiles, device, channels, levels)
+        self._exchange = exchange_of(self._ranks)
         self._id, self._rate = uuid.uuid4().hex, self.cfg.variance_rate
         self._epoch = self._time = self._opened = 0.0  # the last two count from the first
         self._num_commits, self._interrupted, self._rasters = 0, None, []
@@ -146,6 +150,11 @@ class OpenedSite(ReadableSite):
             merges = stored.get("keyframe_merges")
             self._keyframes = None if merges is None else KeyframeLog(self._store, merges)
 
+    def _are_of_others(self, tiles: list[Tile]) -> list[bool]:
+        """Return which tiles other ranks fuse."""
+        x, y = torch.tensor(tiles, dtype=torch.int64, device=self._tiles.device).view(-1, 2).unbind(1)
+        return (self._exchange.find_owners(x, y) != self._ranks.rank).tolist()
+
     # Writing --------------------------------------------------------------------------------------------------------
 
     def _require_writable(self) -> None:
@@ -183,6 +192,8 @@ class OpenedSite(ReadableSite):
         if stored["num_commits"] != attributes["num_commits"]:  # on top of another writer's tiles
             self._tiles.forget()
         self._time, self._num_commits = stored["time"], stored["num_commits"]
+        if self._ranks.size > 1:  # other ranks have written theirs
+            self._tiles.forget(self._are_of_others)
         return contradictions
 
     def _raise_interrupted(self) -> None:

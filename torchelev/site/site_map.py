@@ -39,8 +39,9 @@ from torchelev.site.keyframes.keyframe_log import KeyframeLog, arrays_of, change
 from torchelev.site.keyframes.keyframes import Keyframes, Recorded, correct, record
 from torchelev.site.keyframes.rebuild import merge_recorded, rebuild_moved
 from torchelev.site.rasters.raster_site import RasterSite
-from torchelev.site.shared.collective import gather_windows, open_shared
+from torchelev.site.shared.collective import open_shared
 from torchelev.site.shared.ranks import Ranks
+from torchelev.site.shared.shared_merge import gather_tiles, merge_shared
 from torchelev.site.site_config import SiteConfig
 from torchelev.site.site_levels import SiteLevels
 from torchelev.site.storage.interface import Note, Overtaken
@@ -57,6 +58,8 @@ if TYPE_CHECKING:
 
     from torchelev.levels.config import LevelsConfig
     from torchelev.site.storage.engines import Engine
+
+_FREED_BYTES = 96  # of a cell, which a merge takes and frees: faulted in anew, they take a tenth of its time
 
 
 class SiteMap(RasterSite):
@@ -76,8 +79,8 @@ class SiteMap(RasterSite):
     the later one of two that meet merges on top of the earlier one.
 
     With a `group`, all its ranks hold one site, and `merge` takes the robots of all of them, in the order of the ranks:
-    call it on all ranks, which wait for each other. Reading is up to each rank. On disk, rank 0 writes, and the others
-    read the same folder. See `torchelev.site.shared.collective`.
+    call it on all ranks, which wait for each other and share the work. Reading is up to each rank. On disk, all ranks
+    write to one folder, which all must see, and rank 0 commits. See `torchelev.site.shared.collective`.
 
     Args:
         resolution: [m] of the cells, as of the maps that are merged.
@@ -202,7 +205,7 @@ class SiteMap(RasterSite):
         if self._keyframes is not None:
             T_map_base = _require_poses(emap, T_map_base)
         if emap.device.type == "cpu":
-            keep_freed_memory()
+            keep_freed_memory(_FREED_BYTES * emap.elevation.numel())
         contribution = self._recall_contribution(emap)
         if self._rate is None:
             self._rate = plans[0]["rate"]
@@ -210,9 +213,8 @@ class SiteMap(RasterSite):
         now = now if time is None else self._since_epoch(now)
         state = self._bring(emap)
         windows = read_windows(emap, state, now, contribution)
-        all_windows, own = gather_windows(self._ranks, windows, plans)
-        all_aligned = self._align(all_windows, align, tilt)
-        alignment = Alignment(*(value[own] for value in all_aligned))
+        self._exchange.split(windows.known.corner, windows.is_new.shape[1:])
+        alignment = self._align(windows, align, tilt)
         new = self._record(windows, alignment, T_map_base, now)
         keyframes = torch.full_like(state.elapsed, -1) if new is None else new.ids
         number = self._num_commits + 1
@@ -221,15 +223,14 @@ class SiteMap(RasterSite):
         surfaces, levels = None, self._tiles.levels.cfg
         if levels is not None:  # without a group
             windows, surfaces = read_surfaces(emap, state, windows, self.resolution, levels.min_gap)
-            all_windows = windows
         stack = None if surfaces is None else surfaces.now
         contribution = snapshot(emap, windows, alignment, state.elapsed, keyframes, shares, stack)
         if self._store is None and new is None:  # interrupted, memory may hold a part, which must not count twice
             self._keep(emap, contribution)
-        new_cells = count(windows.is_new)
-        note = describe_merge(len(all_windows.known.corner), int(count(all_windows.is_new).sum()))
+        robots, new_cells = [plan["robots"] for plan in plans], count(windows.is_new)
         try:
-            contradictions = self._fuse(all_windows, all_aligned, now, new, changes, surfaces, note)[own]
+            note = describe_merge(sum(robots), int(self._exchange.sum(new_cells.sum())))
+            contradictions = self._fuse(windows, alignment, robots, now, new, changes, surfaces, note)
         except UncertainCommitError as error:
             self._in_doubt = error.commit, emap, contribution
             raise
@@ -264,7 +265,6 @@ class SiteMap(RasterSite):
         return {
             "same": same,
             "robots": emap.num_envs,
-            "contributed": contribution is not None,
             "now": now,
             "rate": rate,
         }
@@ -296,7 +296,7 @@ class SiteMap(RasterSite):
         if not with_offsets:
             return no_alignment(len(windows.known.corner), self._tiles.device)
         gap = self._tiles.levels.max_difference
-        return align(windows, self._read_cells, self.resolution, self.cfg, with_tilt, gap)
+        return align(windows, self._read_cells, self.resolution, self.cfg, with_tilt, gap, self._exchange)
 
     def _read_cells(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """Return the site's elevation and variance at cells of the lattice, NaN where unknown."""
@@ -314,14 +314,22 @@ class SiteMap(RasterSite):
         self,
         windows: Windows,
         alignment: Alignment,
+        robots: list[int],
         now: float,
         new: Recorded | None,
         changes: dict[str, Change],
         surfaces: SurfaceChange | None,
         note: Note,
     ) -> Int[Tensor, "B"]:
-        """Fuse windows, or their keyframes, into tiles; return each robot's contradictions."""
-        rate, time = self._clock.rate, max(self._time, now)
+        """Fuse windows, or their keyframes, into tiles; return each robot's contradictions. `robots`: of each rank."""
+        rate, time, exchange = self._clock.rate, max(self._time, now), self._exchange
+        if exchange.size > 1:
+            first, number = sum(robots[: exchange.rank]), sum(robots)
+            scale = self.resolution, rate, self.cfg
+            own = merge_shared(self._tiles, windows, alignment, first, number, *scale, exchange)
+            every = own if self._store else gather_tiles(own, exchange)
+            contradictions = exchange.sum(self._write(every, time, number, note=note))
+            return contradictions[first : first + robots[exchange.rank]]
         if self._keyframes is None or new is None:
             parts = merge_windows(self._tiles, windows, alignment, self.resolution, rate, self.cfg, changes, surfaces)
             return self._write(parts, time, len(windows.known.corner), note=note)

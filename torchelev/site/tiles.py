@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
@@ -158,11 +158,13 @@ class Tiles:
         slots = self._fetch(tiles, overwritten=True)
         self.values.index_copy_(1, slots, values)
 
-    def forget(self) -> None:
-        """Drop the tiles that the storage has."""
+    def forget(self, chosen: Callable[[list[Tile]], list[bool]] | None = None) -> None:
+        """Drop the tiles that the storage has: those chosen among them, or all."""
         if self._storage is not None:
-            self._free += self._slots.values()
-            self._slots.clear()
+            tiles = list(self._slots)
+            for tile, is_chosen in zip(tiles, [True] * len(tiles) if chosen is None else chosen(tiles), strict=True):
+                if is_chosen:
+                    self._free.append(self._slots.pop(tile))
 
     def _fetch(self, tiles: Sequence[Tile], overwritten: bool = False) -> Int[Tensor, "n"]:
         """Bring tiles into memory, and return their slots."""

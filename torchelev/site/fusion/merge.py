@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchelev.ops.parallel import map_in_order
-from torchelev.site.fusion.entries import fuse_entries, read_entries, rise
+from torchelev.site.fusion.entries import fuse_entries, read_offers, rise
 from torchelev.site.fusion.fuse_levels import Robots, fuse_levels
 from torchelev.site.fusion.fuse_shares import fuse_channels
 from torchelev.site.fusion.pieces import Group, Pieces, group_tiles
@@ -67,25 +67,28 @@ def merge_windows(
         surfaces: all that the robots know, of a site with levels: the ground of `windows` is the lowest one.
     """
     touched = windows.is_new | windows.is_bounded
+    size = touched[0].numel()
     robots = None if surfaces is None else Robots(windows, surfaces, alignment, resolution)
     if surfaces is not None:
         touched = touched | surfaces.is_touched
     for change in changes.values():
         touched = touched | change.is_new
     groups = group_tiles(windows.known.corner, touched)
+    offers, has_bounds = read_offers(windows, alignment, resolution), bool(windows.is_bounded.any())
     tiles.reserve(sum(tile not in tiles for group in groups for tile in group.tiles))
 
     def fuse_group(group_and_values: tuple[Group, Tensor]) -> Merged:
         group, values = group_and_values
         pieces, layers = group.cut(), values.flatten(1)
         before = layers[_ELEVATION].clone() if tiles.channels else layers[_ELEVATION]
-        robot, cell, place = pieces.select(windows.is_new)
-        entries = read_entries(windows, alignment, robot, cell, place, resolution)
+        cell, place = pieces.find(windows.is_new)
+        entries = offers.at(cell, place)
         if robots is None:
-            robot = robot[fuse_entries(layers, entries, rate, cfg)]
+            robot = place[fuse_entries(layers, entries, rate, cfg)] // size
         else:
-            robot = fuse_levels(layers, entries, robot, place, tiles, robots, pieces, rate, cfg)
-        lower_bounds(layers, *_read_bounds(windows, alignment, pieces, resolution))
+            robot = fuse_levels(layers, entries, place // size, place, tiles, robots, pieces, rate, cfg)
+        if has_bounds:
+            lower_bounds(layers, *_read_bounds(windows, alignment, pieces, resolution))
         fuse_channels(layers, before, layers[_ELEVATION], tiles, pieces, changes)
         contradictions = torch.bincount(robot, minlength=len(alignment.offset))
         return Merged(pieces.tiles, values, contradictions)

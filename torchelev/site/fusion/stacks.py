@@ -143,16 +143,18 @@ def windows_of(windows: Windows, change: Change, resolution: float) -> Windows:
     """Return windows whose ground is that of the surfaces, the lowest ones; their cells are `resolution` [m] wide."""
     ground, known = change.now, windows.known
     is_same = known.elevation.to(ground.upper) == ground.upper[:, 0]
-    contribution = windows.contribution
+    contribution, before = windows.contribution, windows.before
     if contribution is not None and change.before is not None:
         moved = (change.before.corner - contribution.known.corner) * resolution
         alignment = contribution.alignment.of_moved(moved)
-        contribution = contribution._replace(known=_first(contribution.known, change.before), alignment=alignment)
+        before = _first(contribution.known, change.before)
+        contribution = contribution._replace(known=before, alignment=alignment)
     return windows._replace(
         known=_first(known, ground),
         has_normal=windows.has_normal & is_same,
         is_new=change.is_new[:, 0].contiguous(),
         contribution=contribution,
+        before=before,
     )
 
 

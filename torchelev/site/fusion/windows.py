@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from torchelev.layers import absolute_variance
-from torchelev.ops.moving import move_layers
+from torchelev.ops.indexing import read
+from torchelev.ops.moving import HOST_ENVIRONMENTS, move_layers, sources
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
@@ -65,6 +66,7 @@ class Windows(NamedTuple):
     is_bounded: Bool[Tensor, "B H W"]  #: unknown cells that have an upper bound
     is_new: Bool[Tensor, "B H W"]  #: measured since the last merge
     contribution: Contribution | None  #: of the same robots at earlier merges; None: none
+    before: Known | None = None  #: its values, moved to the present windows
 
 
 class Contribution(NamedTuple):
@@ -112,7 +114,8 @@ def read_windows(emap: ElevationMap, state: MapState, now: float, contribution: 
     known = read_known(emap, state, now)
     surface = state.gradient_x, state.gradient_y, state.has_normal
     bound = state.upper_bound, state.bounded & ~state.validity
-    return Windows(known, *surface, *bound, _find_new(state, known, contribution), contribution)
+    before = None if contribution is None else move_known(contribution.known, state.corner)
+    return Windows(known, *surface, *bound, _find_new(state, known, contribution, before), contribution, before)
 
 
 def sideways_variance(state: MapState) -> Float[Tensor, "B H W"]:
@@ -146,17 +149,18 @@ def drop_reset(contribution: Contribution, num_resets: Int[Tensor, "B"], elapsed
     )
 
 
-def _find_new(state: MapState, known: Known, contribution: Contribution | None) -> Bool[Tensor, "B H W"]:
-    """Return which known cells are new: measured since the contribution, or not part of it.
+def _find_new(
+    state: MapState, known: Known, contribution: Contribution | None, before: Known | None
+) -> Bool[Tensor, "B H W"]:
+    """Return which known cells are new: measured since the contribution, whose values these are, or not part of it.
 
     What `initialize_from` gave may be younger than the last merge, but nobody has measured it: no bit of it changes.
     """
-    if contribution is None:
+    if contribution is None or before is None:
         return known.is_known
-    layers = move_known(contribution.known, state.corner)
-    has_changed = (known.elevation != layers.elevation) | (known.variance < layers.variance)
+    has_changed = (known.elevation != before.elevation) | (known.variance < before.variance)
     passed = state.elapsed - contribution.elapsed
-    return find_new(known.is_known, layers.is_known, has_changed, state.time, passed)
+    return find_new(known.is_known, before.is_known, has_changed, state.time, passed)
 
 
 def find_new(is_known: Tensor, was_known: Tensor, has_changed: Tensor, age: Tensor, passed: Int[Tensor, "B"]) -> Tensor:
@@ -174,7 +178,13 @@ def move_known(known: Known, corner: Int[Tensor, "B 2"]) -> Known:
     if not shift.any():
         return known
     layers = {name: getattr(known, name) for name in ("elevation", "variance", "age", "is_known")}
-    return known._replace(corner=corner.clone(), **move_layers(layers, shift, {}))
+    if len(corner) > HOST_ENVIRONMENTS:  # gather; what enters is not known, and its values do not count
+        index, is_entering = sources(shift, H, W)
+        layers = {name: read(layer, index) for name, layer in layers.items()}
+        layers["is_known"] &= ~is_entering
+    else:
+        layers = move_layers(layers, shift, {})
+    return known._replace(corner=corner.clone(), **layers)
 
 
 def snapshot(

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchelev.errors import require
 from torchelev.inputs import checks
-from torchelev.site.fusion.entries import read_entries, read_heights, rise
+from torchelev.site.fusion.entries import read_heights, read_offers, rise
 from torchelev.site.fusion.windows import Alignment, Contribution, Windows
 
 if TYPE_CHECKING:
@@ -140,7 +140,7 @@ def _own_layers(windows: Windows, alignment: Alignment, resolution: float) -> Fl
     B, H, W = windows.is_new.shape
     layers = torch.full((5, B * H * W), torch.nan, device=windows.is_new.device)
     place = windows.is_new.flatten().nonzero()[:, 0]
-    entries = read_entries(windows._replace(contribution=None), alignment, place // (H * W), place, place, resolution)
+    entries = read_offers(windows._replace(contribution=None, before=None), alignment, resolution).at(place, place)
     layers[OWN, place] = torch.stack([*entries.heights, entries.relief])
     place = windows.is_bounded.flatten().nonzero()[:, 0]
     above = rise(windows.known, alignment, place // (H * W), place, resolution)

@@ -1,19 +1,27 @@
-"""One site in many processes: each rank merges its own robots, and all hold the same site.
+"""One site in many processes: each rank merges its own robots, fuses its own tiles, and can read all of them.
 
 A merge of R ranks takes these steps, of which those marked * wait for all ranks:
 
 1. * what each rank is about to do (2 KiB): bad use raises on all of them, before anything changes on any.
-2. * all windows, in one all_gather, see `packing.Layout` for their size. From here on, all ranks compute the same.
-3.   align and fuse. A rank may read tiles from disk, which are as of the last merge.
-4. * on disk: all have read what they need. Rank 0 commits; before, a rank could have read what it fuses again.
-5. * on disk: rank 0 has committed. What a rank reads from now on is as of this merge.
+2. * offsets: the heights to compare go to the owners of their tiles (16 bytes each), which find the pairs. In each
+     round of least squares, ranks add up a histogram and the moments of their pairs, and all solve the same equations.
+3. * new heights go to the owners of their tiles in one all_to_all, see `parts.SentPart` for their size.
+4.   each owner fuses. It may read its tiles from disk, which are as of the last merge.
+5. * in memory: each rank sends its fused tiles to all others. On disk: all have written theirs, and rank 0 commits.
+6. * on disk: rank 0 has committed. What a rank reads from now on is as of this merge.
 
-A rank that raises ends its steps: the others wait for it no longer than the timeout of `init_process_group`, 30 minutes
-with gloo unless another is given, and then raise `LostRankError`. They do at once if its process has ended. With NCCL,
-torch ends the processes that wait instead, see TORCH_NCCL_ASYNC_ERROR_HANDLING.
+The result is that of one process up to the rounding of offsets, whatever the number of ranks. Each rank owns a stretch
+of a space-filling curve, in which as many windows have their centres, of its own where possible, see `owners`: robots
+that are near each other and on one rank send little. Owners change with the windows, as any rank can read any tile.
 
-Ranks compute the same from the same windows. On machines with different processors, or on GPUs, they may differ by
-rounding; on disk is what rank 0 has computed.
+Ranks read without each other, also after one of them is lost. So in memory each one holds the whole site, 28 bytes for
+each cell of a tile, and what falls with the number of ranks is the memory of a merge and of the maps. On disk each one
+keeps its own tiles in memory, and those that it reads.
+
+If reading, fusing or writing tiles raises on one rank, all raise. For a rank that ends, or is interrupted, the others
+wait no longer than the timeout of `init_process_group`, 30 minutes with gloo unless another is given,
+and then raise `LostRankError`. They do at once if its process has ended. With NCCL, torch ends the processes that wait
+instead, see TORCH_NCCL_ASYNC_ERROR_HANDLING. NCCL sends the same tensors, from a GPU; that has not been tried.
 """
 
 from __future__ import annotations
@@ -21,16 +29,12 @@ from __future__ import annotations
 import math
 import uuid
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import torch
-
 from torchelev.errors import require
 from torchelev.site.channels import SiteChannels
-from torchelev.site.fusion.windows import Windows
-from torchelev.site.shared.packing import Layout, pack, unpack
 from torchelev.site.shared.ranks import Ranks
 from torchelev.site.site_levels import SiteLevels
 from torchelev.site.storage.engines import create_store, exists, open_store
@@ -91,26 +95,6 @@ def _open(
     return store
 
 
-def gather_windows(ranks: Ranks, windows: Windows, plans: list[dict[str, Any]]) -> tuple[Windows, slice]:
-    """Return the windows of all ranks' robots, in the order of the ranks, and where those of this rank are.
-
-    Args:
-        ranks: of the site.
-        windows: of this rank.
-        plans: what the ranks sent by `exchange`: their numbers of `robots`, and whether any has `contributed` before.
-    """
-    numbers = [plan["robots"] for plan in plans]
-    own = slice(sum(numbers[: ranks.rank]), sum(numbers[: ranks.rank + 1]))
-    if ranks.size == 1:
-        return windows, own
-    H, W = windows.known.elevation.shape[1:]
-    layout = Layout(H, W, any(plan["contributed"] for plan in plans))
-    rows = pack(windows, layout)
-    padded = torch.nn.functional.pad(rows, (0, 0, 0, max(numbers) - len(rows)))
-    gathered = ranks.all_gather("merge", padded)
-    return unpack(torch.cat([rows[:number] for rows, number in zip(gathered, numbers, strict=True)]), layout), own
-
-
 @contextmanager
 def shared_transaction(
     ranks: Ranks,
@@ -126,17 +110,30 @@ def shared_transaction(
     if store is None:
         yield _write_nothing
         return
-    with ranks.together("merge", lambda: {"version": store.version}) as stored:
-        with store.transaction(attributes, arrays, note) if ranks.rank == 0 else nullcontext(_write_nothing) as write:
-            with ranks.together("merge"):
+    results: list[bytes] = []
+    with ExitStack() as transaction:  # of rank 0; left with an error, it commits nothing
+        invitation = b""
+        with ranks.together("merge"):
+            if ranks.rank == 0:
+                write = transaction.enter_context(store.transaction(attributes, arrays, note))
+                invitation = store.invite() if ranks.size > 1 else b""
+        invitation = ranks.gather_bytes("merge", invitation)[0]
+        with ranks.together("merge"):
+            if ranks.rank == 0:
                 yield write
-    if ranks.rank:
+            else:
+                with store.join_transaction(invitation, results) as write:
+                    yield write
+        shares = ranks.gather_bytes("merge", b"".join(results))[1:]
+        with ranks.together("merge", lambda: {"version": store.version}) as stored:
+            if ranks.rank == 0:
+                store.accept(shares)
+            transaction.close()
+    if ranks.size > 1:
         store.refresh()
-        rule, hint = (
-            f"must show what rank 0 has stored, {stored[0]['version']}",
-            "give all ranks one folder, mounted without a cache",
-        )
-        require(store.version == stored[0]["version"], str(store.path), rule, store.version, hint, OSError)
+        version, hint = stored[0]["version"], "give all ranks one folder, mounted without a cache"
+        rule = f"must show what rank 0 has stored, {version}"
+        require(store.version == version, str(store.path), rule, store.version, hint, OSError)
 
 
 def _write_nothing(*args: object) -> None:

@@ -15,7 +15,7 @@ from torchelev.errors import message, require
 if TYPE_CHECKING:
     from torch.distributed import ProcessGroup
 
-_MESSAGE_BYTES, _MAX_TEXT = 2048, 300
+_MESSAGE_BYTES, _BYTES_OF_RANK, _MAX_TEXT = 2048, 16, 300
 _ERRORS = {error.__name__: error for error in (ValueError, TypeError, KeyError, OSError)}
 
 
@@ -100,8 +100,9 @@ class Ranks:
 
     def _exchange(self, call: str, values: dict[str, Any]) -> list[dict[str, Any]]:
         encoded = json.dumps(values).encode()
-        assert len(encoded) <= _MESSAGE_BYTES
-        sent = torch.tensor([list(encoded.ljust(_MESSAGE_BYTES))], dtype=torch.uint8)
+        size = _MESSAGE_BYTES + _BYTES_OF_RANK * self.size
+        assert len(encoded) <= size
+        sent = torch.tensor([list(encoded.ljust(size))], dtype=torch.uint8)
         return [json.loads(bytes(row.tolist())) for row in self.all_gather(call, sent)[:, 0]]
 
     def _require_same(self, values: list[dict[str, Any]]) -> None:
@@ -113,21 +114,52 @@ class Ranks:
                 actual = f"{first} on rank 0 and {plans[rank][name]} on rank {rank}"
                 raise ValueError(message(name, "must be the same on all ranks", actual, "call all ranks alike"))
 
+    def gather_bytes(self, call: str, data: bytes) -> list[bytes]:
+        """Return the bytes of all ranks."""
+        sizes = [value["bytes"] for value in self.exchange(call, lambda: {"bytes": len(data)})]
+        if self.size == 1 or not any(sizes):
+            return [data] if self.size == 1 else [b""] * self.size
+        row = torch.zeros(max(sizes), dtype=torch.uint8)
+        row[: len(data)] = torch.frombuffer(bytearray(data), dtype=torch.uint8) if data else 0
+        return [part.numpy().tobytes()[:size] for part, size in zip(self.all_gather(call, row), sizes, strict=True)]
+
     def all_gather(self, call: str, rows: Tensor) -> Tensor:
         """Return the rows (R, ...) of all ranks, on the device of these."""
         import torch.distributed as dist
 
+        sent = rows.to(self._device).contiguous()
+        gathered = [torch.empty_like(sent) for _ in range(self.size)]
+        with self._not_lost(call):
+            dist.all_gather(gathered, sent, group=self.group)
+        return torch.stack(gathered).to(rows.device)
+
+    def all_to_all(self, call: str, rows: Tensor, sent: list[int], received: list[int]) -> Tensor:
+        """Send so many of the rows to each rank; return the rows from all, so many from each, on their device."""
+        import torch.distributed as dist
+
+        source = rows.to(self._device).contiguous()
+        target = source.new_empty(sum(received), *source.shape[1:])
+        with self._not_lost(call):
+            dist.all_to_all_single(target, source, received, sent, group=self.group)
+        return target.to(rows.device)
+
+    @property
+    def _device(self) -> torch.device:
+        """The device whose tensors the group sends."""
+        import torch.distributed as dist
+
+        return torch.device("cuda" if dist.get_backend(self.group) == "nccl" else "cpu")
+
+    @contextmanager
+    def _not_lost(self, call: str) -> Iterator[None]:
+        """Raise LostRankError if a rank is lost, or gets lost in the block."""
         if self._lost is not None:
             raise self._lost
-        device = torch.device("cuda") if dist.get_backend(self.group) == "nccl" else torch.device("cpu")
-        sent = rows.to(device).contiguous()
-        gathered = [torch.empty_like(sent) for _ in range(self.size)]
         try:
-            dist.all_gather(gathered, sent, group=self.group)
+            yield
         except RuntimeError as error:
             self._lost = _lost(call, error)
             raise self._lost from error
-        return torch.stack(gathered).to(rows.device)
 
 
 def _lost(call: str, error: Exception) -> LostRankError:

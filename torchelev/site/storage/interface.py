@@ -105,6 +105,20 @@ class SiteStore(Protocol):
         With no tiles and no arrays, the attributes alone may stay in memory.
         """
 
+    def invite(self) -> bytes:
+        """Return what lets other processes join the transaction that is open."""
+
+    def join_transaction(
+        self, invitation: bytes, results: list[bytes]
+    ) -> AbstractContextManager[Callable[[Sequence[Tile] | NDArray, ArrayLike], None]]:
+        """Yield a function that writes tiles into a transaction of another process.
+
+        At the end of the block, what that process has to `accept` is appended to `results`.
+        """
+
+    def accept(self, results: Sequence[bytes]) -> None:
+        """Take what other processes have written into the transaction that is open; its end commits it, too."""
+
     def turn(self) -> AbstractContextManager[bool]:
         """Keep other writers out until the end of the block; yield whether one has committed since it was read."""
 

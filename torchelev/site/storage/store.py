@@ -22,6 +22,8 @@ from torchelev.site.storage.tile_files import Tile, TileFiles, as_tiles
 from torchelev.site.storage.transaction import CommitError, clean, finish, lock_folder, stage
 from torchelev.site.storage.zarr_files import METADATA, encode_metadata, import_tensorstore, wait_for
 
+_MAX_WRITES = 32  # tiles that are written at a time
+
 
 class TileStore:
     """A folder of square tiles of layers, to which one process writes while others read.
@@ -204,6 +206,7 @@ class TileStore:
                     pairs, cells = self._header.check_tiles(as_tiles(tiles), values)
                     writes.extend(self._files.stage(pairs, cells))
                     written.update(pairs)
+                    _wait_for_older(writes)
 
                 try:
                     yield write
@@ -215,6 +218,37 @@ class TileStore:
             self._header, self._tiles = header, self._tiles.union(written)
             with suppress(OSError):  # it is committed: reading finds it, and the next commit moves it
                 finish(self.path)
+
+    def invite(self) -> bytes:
+        """Return nothing: other processes see the folder of the transaction."""
+        return b""
+
+    def accept(self, results: Sequence[bytes]) -> None:
+        """Do nothing: what other processes have written lies in the folder of the transaction."""
+
+    @contextmanager
+    def join_transaction(
+        self, invitation: bytes, results: list[bytes]
+    ) -> Iterator[Callable[[Sequence[Tile] | NDArray, ArrayLike], None]]:
+        """Write tiles into the transaction that is open in another process, which commits them, too.
+
+        Args:
+            invitation: of no use here: processes see one folder.
+            results: likewise.
+
+        Yields:
+            A function of tiles and values, as for `commit`. All is written at the end of the block.
+        """
+        writes: list[Any] = []
+
+        def write(tiles: Sequence[Tile] | NDArray, values: ArrayLike) -> None:
+            writes.extend(self._files.stage(*self._header.check_tiles(as_tiles(tiles), values)))
+            _wait_for_older(writes)
+
+        try:
+            yield write
+        finally:
+            wait_for(writes)
 
     @property
     def is_read_only(self) -> bool:
@@ -280,6 +314,13 @@ class TileStore:
         if clean(self.path):
             self.refresh()
         named_arrays.check_names(self.path, names)
+
+
+def _wait_for_older(writes: list[Any]) -> None:
+    """Wait until few enough of the writes are left, as their tiles stay in memory."""
+    done = max(0, len(writes) - _MAX_WRITES)
+    wait_for(writes[:done])
+    del writes[:done]
 
 
 def _size(file: Path) -> int:

@@ -24,10 +24,8 @@ def list_versions(repository: Any) -> list[Version]:
     """Return the versions of the branch, the newest first, and behind them those that tags alone keep."""
     tags = _read_tags(repository)
     versions = {each.id: _describe(each, tags) for each in _merges(repository, branch="main")}
-    for snapshot in tags.keys() - versions.keys():
-        tagged = repository.lookup_snapshot(snapshot)
-        versions[snapshot] = _describe(tagged, tags)
-    return list(versions.values())
+    others = [_describe(repository.lookup_snapshot(each), tags) for each in tags.keys() - versions.keys()]
+    return [*versions.values(), *sorted(others, key=lambda version: version.time, reverse=True)]
 
 
 def find(repository: Any, path: str | Path, version: str) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import pickle
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -37,6 +38,7 @@ from torchelev.site.storage.versioned.repository import (
 )
 
 _WAIT = 120.0  # [s] for other writers of a folder
+_MAX_WRITES = 4  # groups of tiles that are written at a time
 _MARK = "history/mark"  # an array that changes where attributes alone do: a commit has to change something
 _GROUPS = ("keyframes", "merges")  # made at the start: two writers that made one each could not both commit
 
@@ -61,11 +63,13 @@ class VersionedStore:
 
     _header: Header
     _tiles: frozenset[Tile]
+    _open: Any
 
     def __init__(self, path: str | Path, *, version: str | None = None, read_only: bool = False) -> None:
         self.path, self.is_closed, self._pinned = path, False, version
         self._read_only, self._mutex = read_only or version is not None, RLock()
         self._lock = None if is_url(path) else FileLock(Path(path) / LOCK, timeout=_WAIT, thread_local=False)
+        self._open, self._num_accepted = None, 0  # session of a transaction; how many processes have joined it
         self._thread = ThreadPoolExecutor(1, "torchelev site")
         with errors_in_words(path):
             self._repository = import_icechunk().Repository.open(open_storage(path), configuration())
@@ -244,26 +248,15 @@ class VersionedStore:
             not self._read_only, str(self.path), "must be open for writing", "a store that is read-only or closed", hint
         )
         named.check_names(list(arrays or {}))
-        writes: list[Future[None]] = []
         written: set[Tile] = set()
-
-        def write(tiles: Sequence[Tile] | NDArray, values: ArrayLike) -> None:
-            pairs, cells = header.check_tiles(as_tiles(tiles), values)
-            written.update(pairs)
-            writes.append(self._thread.submit(asyncio.run, chunks.put(session.store, pairs, cells)))
-
         with self._alone(), errors_in_words(self.path):
             session = self._repository.writable_session("main")
             if str(session.snapshot_id) != self.version:
                 raise Overtaken
-            try:
+            self._open, self._num_accepted = session, 0
+            with self._writer(session, header, written) as write:
                 yield write
-            finally:
-                failures = [each.exception() for each in writes]
-            for failure in failures:
-                if failure is not None:
-                    raise failure
-            if not (written or arrays):
+            if not (written or arrays or self._num_accepted):
                 if self._differs_in_time_alone(header):  # a merge of nothing new makes no version
                     self._header = header
                     return
@@ -271,6 +264,51 @@ class VersionedStore:
             for name, (array, own) in (arrays or {}).items():
                 named.write_array(session.store, name, array, own)
             self._commit(session, header, written, note or Note(f"{len(written)} tile{'s' * (len(written) != 1)}"))
+
+    @contextmanager
+    def _writer(
+        self, session: Any, header: Header, written: set[Tile]
+    ) -> Iterator[Callable[[Sequence[Tile] | NDArray, ArrayLike], None]]:
+        """Yield a function that writes tiles to a session on another thread; all are written at the end."""
+        writes: list[Future[None]] = []
+
+        def write(tiles: Sequence[Tile] | NDArray, values: ArrayLike) -> None:
+            pairs, cells = header.check_tiles(as_tiles(tiles), values)
+            written.update(pairs)
+            writes.append(self._thread.submit(asyncio.run, chunks.put(session.store, pairs, cells)))
+            while len(writes) > _MAX_WRITES:  # as their tiles stay in memory
+                writes.pop(0).result()
+
+        try:
+            yield write
+        finally:
+            failures = [each.exception() for each in writes]
+        for failure in failures:
+            if failure is not None:
+                raise failure
+
+    def invite(self) -> bytes:
+        """Return what lets other processes join the transaction that is open."""
+        return pickle.dumps(self._open.fork())
+
+    @contextmanager
+    def join_transaction(
+        self, invitation: bytes, results: list[bytes]
+    ) -> Iterator[Callable[[Sequence[Tile] | NDArray, ArrayLike], None]]:
+        """Yield a function that writes tiles into a transaction of another process, as of `SiteStore`."""
+        fork, written = pickle.loads(invitation), set[Tile]()  # of a rank of the same program
+        with errors_in_words(self.path), self._writer(fork, self._header, written) as write:
+            yield write
+        if written:
+            results.append(pickle.dumps(fork))
+
+    def accept(self, results: Sequence[bytes]) -> None:
+        """Take what other processes have written into the transaction that is open."""
+        forks = [pickle.loads(result) for result in results if result]
+        self._num_accepted = len(forks)
+        if forks:
+            with errors_in_words(self.path):
+                self._open.merge(*forks)
 
     def _differs_in_time_alone(self, header: Header) -> bool:
         """Return whether a header says nothing new but the time and number of a merge."""
@@ -284,7 +322,7 @@ class VersionedStore:
         try:
             make = partial(history.metadata_of, note=note, key=key)
             snapshot, header = commit(self._repository, session, self.path, header, note.message, key, make)
-            if header.attributes != before:  # on top of another writer's
+            if header.attributes != before or self._num_accepted:  # with tiles of other writers
                 self._show(snapshot)
                 return
             self._session = self._repository.readonly_session(snapshot_id=snapshot)
