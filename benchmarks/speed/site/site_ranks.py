@@ -50,7 +50,7 @@ def measure(sizes: Sizes, processes: list[int]) -> list[dict[str, Any]]:
     runs: list[list[dict[str, Any]]] = [[] for _ in rows]
     for _ in progress(range(sizes.repeats), "repeats"):
         for row, its_runs in zip(rows, runs, strict=True):
-            its_runs.append(_measure(sizes, row["processes"], row["on_disk"]))
+            its_runs.append(_measure(sizes, row["processes"], bool(row["on_disk"])))
     return [row | _summarise(its_runs) for row, its_runs in zip(rows, runs, strict=True)]
 
 
@@ -87,7 +87,7 @@ def _rank(rank: int, size: int, sizes: Sizes, on_disk: bool, folder: Path) -> No
     site = SiteMap(RESOLUTION, folder / "site" if on_disk else None, group=dist.group.WORLD)
     own = slice(rank * sizes.robots // size, (rank + 1) * sizes.robots // size)
     corner = lattice(sizes.robots, SPACING)[own]
-    windows, result = Windows(len(corner), CELLS), {"ms": [], "cpu_ms": []}
+    windows, result = Windows(len(corner), CELLS), dict[str, list[float]](ms=[], cpu_ms=[])
     windows.look(corner)
     before = peak_megabytes()
     for number in range(sizes.merges + 1):

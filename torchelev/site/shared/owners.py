@@ -33,7 +33,7 @@ class Owners(NamedTuple):
 
     begins: Int[Tensor, "R1"]  #: of all stretches but the first
     rank: Int[Tensor, "R"]  #: whose they are
-    is_exchanged: bool
+    is_exchanged: bool  #: x and y
 
     def find(self, x: Int[Tensor, "K"], y: Int[Tensor, "K"]) -> Int[Tensor, "K"]:
         """Return the ranks that own tiles x, y."""

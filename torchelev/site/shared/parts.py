@@ -46,10 +46,10 @@ def choose_cells(windows: Windows, pieces: Pieces) -> Chosen:
 class OwnPart(NamedTuple):
     """What a rank's windows say of its own tiles, which is read from them group by group."""
 
-    chosen: Chosen
-    windows: Windows
-    alignment: Alignment
-    offers: Offers
+    chosen: Chosen  #: cells on its tiles
+    windows: Windows  #: of its robots
+    alignment: Alignment  #: of these
+    offers: Offers  #: of these
     first: int  #: place of the rank's first cell in the flat windows of all ranks
     resolution: float  #: [m]
 
