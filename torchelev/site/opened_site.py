@@ -40,6 +40,7 @@ class OpenedSite(ReadableSite):
     _opened: float
     _num_commits: int
     _interrupted: BaseException | None
+    _robots: dict[str, Any]  # what `torchelev.site.service` noted of each robot's last merge
 
     @classmethod
     def open(
@@ -85,7 +86,7 @@ class OpenedSite(ReadableSite):
         self._tiles = Tiles(self._store, self.cfg.cache_tiles, device, channels, levels)
         self._id, self._rate = uuid.uuid4().hex, self.cfg.variance_rate
         self._epoch = self._time = self._opened = 0.0  # the last two count from the first
-        self._num_commits, self._interrupted = 0, None
+        self._num_commits, self._interrupted, self._robots = 0, None, {}
         self._rollbacks: list[list[int]] = []
         self._read_attributes()
 
@@ -132,6 +133,7 @@ class OpenedSite(ReadableSite):
         merges = None if self._keyframes is None else self._keyframes.num_merges + new_merges
         own["channels"] = self._tiles.channels.attributes
         own |= self._tiles.levels.attributes | ({"rollbacks": self._rollbacks} if self._rollbacks else {})
+        own |= {"robots": self._robots} if self._robots else {}
         return own | {"variance_rate": self._rate, "keyframe_merges": merges}
 
     def _read_attributes(self) -> None:
@@ -140,6 +142,7 @@ class OpenedSite(ReadableSite):
         if "num_commits" in stored:  # it has been merged into
             self._epoch, self._time = stored["epoch"], stored["time"]
             self._opened, self._num_commits = self._time, stored["num_commits"]
+            self._robots = stored.get("robots", {})
             self._rate = stored["variance_rate"] if self.cfg.variance_rate is None else self.cfg.variance_rate
             merges = stored.get("keyframe_merges")
             self._keyframes = None if merges is None else KeyframeLog(self._store, merges)
