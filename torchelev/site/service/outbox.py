@@ -41,7 +41,7 @@ class _Left(NamedTuple):
 
     corner: Int[Tensor, "B 2"]
     mask: Bool[Tensor, "B H W"]
-    part: Snapshot | None  # None: it was dropped, as too much waited
+    part: Snapshot | None  # None: it was sent with the windows, or dropped as too much waited
 
 
 class _Flight(NamedTuple):
@@ -78,7 +78,8 @@ class Outbox:
         self._key, self._link = key, uuid.uuid4().hex
         self._site, self._epoch = "", 0
         self._left: deque[_Left] = deque()
-        self._latest: Snapshot | None = None
+        self._latest: Snapshot | None = None  # not sent
+        self._last: Snapshot | None = None  # sent or not
         self._flight: _Flight | None = None
         self._payload: bytes | None = None
         self._offset: Tensor | None = None
@@ -103,11 +104,13 @@ class Outbox:
 
     def add(self, snapshot: Snapshot) -> None:
         """Take what the windows know now."""
-        if self._latest is not None:
-            part = find_left(self._latest, snapshot)
-            if part.counts.any():
+        part = None if self._last is None else find_left(self._last, snapshot)
+        if part is not None and part.counts.any():
+            if self._latest is not None:
                 self._keep(part)
-        self._latest = snapshot
+            else:  # it has been sent with all others
+                self._left.append(_Left(part.known.corner, part.known.is_known, None))
+        self._latest = self._last = snapshot
 
     def _keep(self, part: Snapshot) -> None:
         last = self._left[-1].part if self._left else None
@@ -178,17 +181,28 @@ class Outbox:
         return snapshot is not None and self._fly(snapshot, None)
 
     def _fly(self, snapshot: Snapshot, left: _Left | None) -> bool:
-        was = self.contribution
-        if was is not None:
-            was_reset = (was.num_resets != snapshot.num_resets) | (snapshot.elapsed < was.elapsed)
-            self.contribution = drop_reset(was, snapshot.num_resets, snapshot.elapsed)
-            if self._offset is not None:
-                self._offset = torch.where(was_reset, torch.nan, self._offset)
-        windows = make_windows(snapshot, self.contribution)
+        windows = make_windows(snapshot, self.recall(snapshot.num_resets, snapshot.elapsed))
         if not (windows.is_new | windows.is_bounded).any():
             return False
         self._flight, self._payload = _Flight(windows, snapshot, left), None
         return True
+
+    def recall(self, num_resets: Int[Tensor, "B"], elapsed: Int[Tensor, "B"]) -> Contribution | None:
+        """Return what the site has of the maps, and forget it of those that were reset since; None: nothing."""
+        was = self.contribution
+        if was is not None:
+            was_reset = (was.num_resets != num_resets) | (elapsed < was.elapsed)
+            self.contribution = drop_reset(was, num_resets, elapsed)
+            if self._offset is not None:
+                self._offset = torch.where(was_reset, torch.nan, self._offset)
+        return self.contribution
+
+    def begin_with(self, contribution: Contribution) -> None:
+        """Take what the maps know now as what the site has of them: they were filled from it, and nothing waits."""
+        known, zero = contribution.known, torch.zeros_like(contribution.known.elevation)
+        surface = zero, zero, zero.bool(), zero, zero.bool()
+        self._last = Snapshot(known, *surface, known.age, contribution.elapsed, contribution.num_resets)
+        self.contribution = contribution
 
     # Answers --------------------------------------------------------------------------------------------------------
 

@@ -172,6 +172,7 @@ class RobotLink(SiteReader):
             with self._changed, torch.no_grad():
                 payload = self._outbox.next_message(clocks.monotonic())
                 if payload is None:
+                    self._changed.notify_all()  # what waited may have held nothing new
                     self._changed.wait(_IDLE)
             if payload is not None and not self._is_closed:
                 self._channel.send(payload)
@@ -219,13 +220,14 @@ class RobotLink(SiteReader):
         require(abs(actual - resolution) <= 1e-9 * resolution, "emap", rule, f"{actual:g} m", "cells must line up")
         site = Remembered(*(_spread(areas.layers.get(name), ids, state.elevation) for name in Remembered._fields))
         with self._changed:
-            was = self._outbox.contribution
+            num_resets = emap.num_resets.cpu()[envs]
+            was = self._outbox.recall(num_resets, state.elapsed)
             if was is None:
                 known = Known(*(value.index_select(0, envs) for value in read_known(emap, whole, now)))
-                was = no_contribution(known, emap.num_resets.cpu()[envs])
+                was = no_contribution(known, num_resets)
             was = move_contribution(was, state.corner, now, resolution)
             after = fill(state, emap, site, was, chosen, resolution)
-            self._outbox.contribution = add_filled(was, state, after, rate, chosen)
+            self._outbox.begin_with(add_filled(was, state, after, rate, chosen))
         return after
 
 
