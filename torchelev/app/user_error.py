@@ -14,7 +14,7 @@ BAD_INPUT, EMPTY_MAP = 2, 3  # exit codes
 # The extra of torchelev that installs a package.
 _EXTRAS = {
     "rosbags": "bags", "mcap": "bags", "av": "video", "viser": "view", "trimesh": "view", "tensorstore": "site",
-    "kiss_icp": "odometry", "onnxruntime": "deploy",
+    "kiss_icp": "odometry", "zenoh": "serve", "onnxruntime": "deploy",
 }  # fmt: skip
 
 

@@ -139,10 +139,10 @@ class OpenedSite(ReadableSite):
     def _read_attributes(self) -> None:
         stored = {} if self._store is None else self._store.attributes
         self._id, self._rollbacks = stored.get("id", self._id), stored.get("rollbacks", [])
+        self._robots = stored.get("robots", {})
         if "num_commits" in stored:  # it has been merged into
             self._epoch, self._time = stored["epoch"], stored["time"]
             self._opened, self._num_commits = self._time, stored["num_commits"]
-            self._robots = stored.get("robots", {})
             self._rate = stored["variance_rate"] if self.cfg.variance_rate is None else self.cfg.variance_rate
             merges = stored.get("keyframe_merges")
             self._keyframes = None if merges is None else KeyframeLog(self._store, merges)

@@ -18,7 +18,7 @@ torch.set_num_threads(1)
 from torchelev.site.service import NetworkedServer, SiteServer
 from torchelev.site.storage import store
 
-path, port, place, number = sys.argv[1], sys.argv[2], sys.argv[3], int(sys.argv[4])
+path, port, place, number, engine = sys.argv[1], sys.argv[2], sys.argv[3], int(sys.argv[4]), sys.argv[5]
 merges = 0
 
 def die(at):
@@ -31,16 +31,16 @@ def finish(folder):  # the commit is on disk, its files are not in place
     return with_files(folder)
 store.finish = finish
 
-server = SiteServer(path, resolution=0.1, align=False)
+server = SiteServer(path, resolution=0.1, align=False, engine=engine)
 write = server.site._write
-def write_and_count(parts, *arguments):
+def write_and_count(parts, *arguments, **options):
     global merges
     merges += 1
     def some():
         for part in parts:
             yield part
             die("writing")
-    result = write(some(), *arguments)
+    result = write(some(), *arguments, **options)
     die("before the answer")
     return result
 server.site._write = write_and_count
@@ -53,9 +53,9 @@ with NetworkedServer(server, listen=f"tcp/127.0.0.1:{port}") as network:
 class MergerProcess:
     """A merger that runs until it is stopped, or ends by itself."""
 
-    def __init__(self, path, port, place="nowhere", number=0):
+    def __init__(self, path, port, place="nowhere", number=0, engine="files"):
         env = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_WAIT_POLICY": "PASSIVE"}
-        arguments = [sys.executable, "-c", SCRIPT, str(path), str(port), place, str(number)]
+        arguments = [sys.executable, "-c", SCRIPT, str(path), str(port), place, str(number), engine]
         self._process = subprocess.Popen(arguments, env=env, cwd=ROOT, stdout=subprocess.PIPE, text=True)
         assert self._process.stdout.readline() == "ready\n"
 

@@ -1,5 +1,7 @@
 """Nothing is lost and nothing counts twice, on a network that loses, repeats and reorders."""
 
+import errno
+import shutil
 import warnings
 
 import numpy as np
@@ -8,6 +10,7 @@ import torch
 
 from tests.site.helpers import known_cells
 from tests.site.service.walks import START, Network, Walker, assert_same
+from torchelev.site import SiteMap
 from torchelev.site.service.merger import SiteServer
 from torchelev.site.service.outbox import Outbox
 
@@ -155,24 +158,67 @@ def message_of(network):
 
 
 def test_a_commit_that_fails_leaves_the_robot_waiting(tmp_path, monkeypatch):
-    network = Network([Walker("a")], path=tmp_path / "site")
+    network = Network([Walker("a")], path=tmp_path / "site", engine="files")
     network.walk()
     network.exchange()
-    store = type(network.server.site._store)
     with monkeypatch.context() as patch:
-        patch.setattr(store, "_prepare", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+        patch.setattr(network.server.site._store, "_prepare", raise_full)
         network.walk()
         network.server.handle(message_of(network), "a")
-        with pytest.raises(OSError):
+        with pytest.raises(OSError, match="No space left"):
             network.server.step()
     network.drain()
     assert_same(network.server.site, network.direct)
     network.server.close()
 
 
-def test_merges_of_other_maps_keep_the_notes(tmp_path):
-    from torchelev.site import SiteMap
+def raise_full(*_):
+    raise OSError(errno.ENOSPC, "No space left on device")
 
+
+def test_two_mergers_of_one_folder_count_a_message_once(tmp_path):
+    pytest.importorskip("icechunk")
+    network = Network([Walker("a"), Walker("b", y=1.0, seed=1)], path=tmp_path / "site", engine="icechunk")
+    network.walk()
+    network.exchange()
+    other = SiteServer(tmp_path / "site", clock=lambda: START + 1e6, align=False)
+    for _ in range(3):
+        network.walk()
+        payloads = {name: outbox.next_message(network.time + 100.0) for name, outbox in network.outboxes.items()}
+        for server in (other, network.server):  # both get what both robots send
+            for name, payload in payloads.items():
+                server.handle(payload, name)
+            assert len(server.step()) >= 2
+        network.time += 100.0
+        network.drain()
+    network.server.site.refresh()
+    assert_same(network.server.site, network.direct)
+    assert other.counts["merged"] + network.server.counts["merged"] == 2 + 3 * 2
+
+
+def test_after_a_rollback_a_robot_must_begin_anew(tmp_path):
+    pytest.importorskip("icechunk")
+    network = Network([Walker("a")], path=tmp_path / "site", engine="icechunk")
+    network.walk()
+    network.exchange()
+    version = network.server.site.version
+    network.walk()
+    network.exchange()
+    with SiteMap.open(tmp_path / "site") as site:  # another process
+        site.rollback(version)
+    network.walk()
+    network.exchange()
+    assert "after a rollback" in str(network.outboxes["a"].error)
+    walker = network.walkers[0]
+    walker.emap.reset()
+    network.outboxes["a"] = Outbox("a", 0.1)
+    walker.step()
+    network.outboxes["a"].add(walker.snapshot())
+    network.drain()
+    assert network.server.counts["merged"] == 3
+
+
+def test_merges_of_other_maps_keep_the_notes(tmp_path):
     network, other = Network([Walker("a")], path=tmp_path / "site"), Walker("b", y=3.0)
     network.walk()
     network.server.handle(message_of(network), "a")
@@ -232,9 +278,7 @@ def test_two_links_that_greet_at_once_both_count():
 
 
 def test_a_site_that_lacks_the_last_merge_refuses(tmp_path):
-    import shutil
-
-    network = Network([Walker("a")], path=tmp_path / "site")
+    network = Network([Walker("a")], path=tmp_path / "site", engine="files")
     network.walk()
     network.exchange()
     network.server.close()

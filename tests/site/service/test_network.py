@@ -115,19 +115,27 @@ def test_what_cannot_be_filled_changes_nothing(port):
         assert torch.equal(value, walker.emap.state_dict()[name]), name
 
 
-PLACES = "writing", "committed", "before the answer"
+DEATHS = [
+    ("writing", "files"),
+    ("committed", "files"),
+    ("before the answer", "files"),
+    ("writing", "icechunk"),
+    ("before the answer", "icechunk"),
+]
 
 
 @pytest.mark.slow(6)
-@pytest.mark.parametrize("place", PLACES)
-def test_a_merger_that_is_killed_counts_nothing_twice_and_loses_nothing(tmp_path, port, place):
+@pytest.mark.parametrize(("place", "engine"), DEATHS)
+def test_a_merger_that_is_killed_counts_nothing_twice_and_loses_nothing(tmp_path, port, place, engine):
+    if engine == "icechunk":
+        pytest.importorskip("icechunk")
     direct, walkers = SiteMap(0.1), [Walker("a"), Walker("b", 1.0, 1)]
     for walker in walkers:
         walker.time = time.time() - 1000.0
     with contextlib.ExitStack() as stack:
         at = f"tcp/127.0.0.1:{port}"
         links = [stack.enter_context(RobotLink(each.emap, each.name, connect=at)) for each in walkers]
-        with MergerProcess(tmp_path / "site", port, place, 3) as merger:
+        with MergerProcess(tmp_path / "site", port, place, 3, engine) as merger:
             for _ in range(4):
                 walk(walkers, links, direct, steps=1)
                 time.sleep(0.3)
@@ -181,7 +189,7 @@ def test_a_merger_that_stands_still_for_a_while_goes_on(tmp_path, port):
 
 @pytest.mark.slow(2)
 def test_a_second_merger_is_refused(tmp_path, port):
-    with serving(port, SiteServer(tmp_path / "site")):
+    with serving(port, SiteServer(tmp_path / "site", engine="files")):
         with pytest.raises(OSError, match="expected one writer at a time"):
             SiteServer(tmp_path / "site")
         with pytest.raises(OSError, match="listen: must be free endpoints"):

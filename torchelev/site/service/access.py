@@ -8,9 +8,14 @@ from pathlib import Path
 
 from torchelev.errors import require
 from torchelev.io.errors import RecordingError
+from torchelev.site.service.messages import Message, MessageError
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 _SHORTEST = 16  # characters of a key
+
+
+class ForbiddenError(Exception):
+    """A robot may not send this. It is not answered: whoever has no key learns nothing."""
 
 
 def check_name(argument: str, name: object) -> str:
@@ -34,6 +39,30 @@ def check_keys(keys: Mapping[str, str] | None) -> dict[str, bytes] | None:
     if keys is None:
         return None
     return {check_name("robots", name): check_key(f"robots: key of {name}", key) for name, key in keys.items()}
+
+
+def check_sender(message: Message, delivered_as: str | None, keys: Mapping[str, bytes] | None) -> str:
+    """Return the robot whose message it is.
+
+    Args:
+        message: as it came.
+        delivered_as: name of the robot by whose key of the network it came; None: not known.
+        keys: of the robots that may write; None: all may.
+
+    Raises:
+        MessageError: it names no robot.
+        ForbiddenError: it names another one than the network does, or is not signed with that robot's key.
+    """
+    try:
+        name = check_name("robot", message.header.get("robot"))
+    except ValueError as error:
+        raise MessageError(str(error)) from error
+    if delivered_as is not None and delivered_as != name:
+        raise ForbiddenError(f"{delivered_as} sent windows of {name}")
+    key = None if keys is None else keys.get(name)
+    if keys is not None and (key is None or not message.is_signed_with(key)):
+        raise ForbiddenError(f"{name} has another key, or none")
+    return name
 
 
 def read_keys(path: Path) -> dict[str, str]:

@@ -15,7 +15,8 @@ _TEXTS = {
     SUPERSEDED: "another link has this name since; give each robot a name of its own",
     OTHER_SITE: "the merger holds another site than the one that this robot has merged into; "
     "reset the map and make a new link",
-    LOST: "the site lacks this robot's last merge, as after a restored backup; reset the map and make a new link",
+    LOST: "the site lacks this robot's last merge, as after a rollback or a restored backup; "
+    "reset the map and make a new link",
 }
 
 

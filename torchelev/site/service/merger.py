@@ -5,6 +5,7 @@ from __future__ import annotations
 import time as clocks
 from collections import Counter
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,24 +14,21 @@ import torch
 from torchelev.errors import message
 from torchelev.site.fusion.merge import MergeReport
 from torchelev.site.fusion.windows import Alignment
-from torchelev.site.service.access import check_keys, check_name
+from torchelev.site.service.access import ForbiddenError, check_keys, check_sender
+from torchelev.site.service.answers import Answer, Answers, note_of
 from torchelev.site.service.inbox import Entry, Inbox
-from torchelev.site.service.ledger import Decision, Sender, Verdict, decide, next_epoch, sender_of
-from torchelev.site.service.messages import Message, MessageError, OtherVersionError, decode, encode, take_text
+from torchelev.site.service.ledger import Decision, Sender, Verdict, decide, sender_of
+from torchelev.site.service.messages import Message, MessageError, OtherVersionError, decode, take_text
 from torchelev.site.service.questions import answer_question
 from torchelev.site.service.served_site import ServedSite
 from torchelev.site.service.windows_message import Received, from_message, join
 from torchelev.site.site_config import SiteConfig
+from torchelev.site.storage import engines
+from torchelev.site.storage.engines import Engine
+from torchelev.site.storage.interface import Overtaken
 
 _MAX_AHEAD = 10.0  # [s] of a robot's clock before the merger's
 _MOST_CELLS = 1 << 22  # of the windows that are merged at a time
-
-
-class Answer(NamedTuple):
-    """What the merger tells a robot, or all."""
-
-    robot: str | None  #: name; None: all
-    payload: bytes  #: the message
 
 
 class Merged(NamedTuple):
@@ -57,10 +55,12 @@ class SiteServer:
     It keeps nothing but the site: a server that is killed and started again goes on where the last commit is.
 
     Args:
-        path: folder of the site, made if it is not there, which needs ``torchelev[site]``; None: in memory.
+        path: folder or s3://bucket/prefix of the site, made if it is not there, which needs ``torchelev[site]``; None:
+            in memory.
         resolution: [m] of a new site; None: that of the folder, or 0.1.
         cfg: how windows are aligned and fused.
         device: that fuses.
+        engine: of a new site, as of `SiteMap`.
         keys: a key for each robot that may write, of at least 16 characters; messages are signed with them. None: all
             robots may write that reach the server.
         align: find the robots' height offsets; otherwise their heights count as they are.
@@ -74,8 +74,8 @@ class SiteServer:
 
     Raises:
         ValueError: the site has another resolution, keeps channels, levels or keyframes, or a key is too short.
-        OSError: another process writes to the folder.
-        ModuleNotFoundError: tensorstore is missing.
+        OSError: the folder or object store cannot be written, or another process writes to a site of files.
+        ModuleNotFoundError: the engine is missing.
     """
 
     def __init__(
@@ -85,13 +85,15 @@ class SiteServer:
         resolution: float | None = None,
         cfg: SiteConfig | None = None,
         device: torch.device | str = "cpu",
+        engine: Engine | None = None,
         keys: Mapping[str, str] | None = None,
         align: bool = True,
         tilt: bool = False,
         clock: Callable[[], float] = clocks.time,
     ) -> None:
         self._keys, self._align, self._tilt, self._clock = check_keys(keys), align, tilt, clock
-        self.site = _open(path, resolution, cfg, device)
+        self.site = _open(path, resolution, cfg, device, engine)
+        self._answers = Answers(self.site, self._keys)
         self.counts: Counter[str] = Counter()
         self.on_merge: Callable[[Merged], None] | None = None
         self._inbox = Inbox()
@@ -137,16 +139,16 @@ class SiteServer:
         """Answer a message, or let it wait to be merged."""
         try:
             received = decode(entry.payload)
-            robot = self._check_access(received, entry.robot)
+            robot = check_sender(received, entry.robot, self._keys)
             kind = take_text(received.header, "kind")
             if kind == "hello":
-                return [self._welcome(robot, received.header)]
+                return [self._answers.welcome(robot, received.header)]
             if kind != "windows":
                 raise MessageError(f"message: must be hello or windows, got {kind}")
             return self._take_windows(robot, received, waiting)
         except OtherVersionError as error:
-            return [] if entry.robot is None else [self._refuse(entry.robot, {}, "version", str(error))]
-        except _ForbiddenError:
+            return [] if entry.robot is None else [self._refuse(entry.robot, None, "version", str(error))]
+        except ForbiddenError:
             self.counts["refused"] += 1
         except MessageError:
             self.counts["damaged"] += 1
@@ -166,32 +168,23 @@ class SiteServer:
         if measured > now + _MAX_AHEAD:
             rule = "must be on the clock that all robots and the merger share"
             text = message("time", rule, f"{measured:.1f} s at {now:.1f} s", "set the robot's clock")
-            return [self._refuse(robot, _about(sender), "time", text)]
+            return [self._refuse(robot, sender, "time", text)]
         waiting[robot] = _Waiting(robot, sender, windows)
         return []
-
-    def _check_access(self, received: Message, robot: str | None) -> str:
-        """Return the robot of a message; raise unless it may send it."""
-        try:
-            name = check_name("robot", received.header.get("robot"))
-        except ValueError as error:
-            raise MessageError(str(error)) from error
-        if robot is not None and robot != name:
-            raise _ForbiddenError(f"{robot} sent windows of {name}")
-        key = None if self._keys is None else self._keys.get(name)
-        if self._keys is not None and (key is None or not received.is_signed_with(key)):
-            raise _ForbiddenError(f"{name} has another key, or none")
-        return name
 
     def _answer(self, robot: str, sender: Sender, decision: Decision) -> list[Answer]:
         """Answer a message that is not merged."""
         if decision.verdict is Verdict.AGAIN:
             self.counts["repeated"] += 1
-            return [self._acknowledge(robot, self.site.notes[robot])]
+            return [self._answers.acknowledge(robot)]
         if decision.verdict is Verdict.REFUSE:
-            return [self._refuse(robot, _about(sender), decision.reason, decision.text)]
+            return [self._refuse(robot, sender, decision.reason, decision.text)]
         self.counts["late" if decision.verdict is Verdict.DROP else "repeated"] += 1
         return []
+
+    def _refuse(self, robot: str, sender: Sender | None, reason: str, text: str) -> Answer:
+        self.counts["refused"] += 1
+        return self._answers.refuse(robot, sender, reason, text)
 
     # Merging --------------------------------------------------------------------------------------------------------
 
@@ -209,23 +202,49 @@ class SiteServer:
     def _merge_or_refuse(self, group: list[_Waiting]) -> list[Answer]:
         """Merge some messages; if that is impossible, each one alone, and refuse those that cannot be merged."""
         try:
-            return self._merge(group)
+            while True:
+                try:
+                    return self._merge(group)
+                except Overtaken:  # by another process, whose notes may have some of these messages
+                    self.site.refresh()
+        except OSError:  # a commit whose connection ended may be stored: its notes tell
+            with suppress(OSError):
+                self.site.refresh()
+            raise
         except (ValueError, RuntimeError) as error:
             if len(group) > 1:
                 return [answer for each in group for answer in self._merge_or_refuse([each])]
             text = f"its windows cannot be merged ({error})"
-            return [self._refuse(group[0].robot, _about(group[0].sender), "unusable", text)]
+            return [self._refuse(group[0].robot, group[0].sender, "unusable", text)]
 
     def _merge(self, group: list[_Waiting]) -> list[Answer]:
-        """Merge some messages in one commit; return their acknowledgements and the new version."""
-        start, received = clocks.perf_counter(), join([each.received for each in group])
+        """Merge some messages in one commit, in turn with other writers; return what to answer."""
+        start = clocks.perf_counter()
+        with self.site.turn():
+            answers, group = self._decide_again(group)
+            return answers + (self._merge_now(group, start) if group else [])
+
+    def _decide_again(self, group: list[_Waiting]) -> tuple[list[Answer], list[_Waiting]]:
+        """Return answers to the messages that other processes have merged meanwhile, and those that still count."""
+        answers, left = list[Answer](), list[_Waiting]()
+        for each in group:
+            decision = decide(self.site.notes.get(each.robot), each.sender, True)
+            if decision.verdict is Verdict.MERGE:
+                left.append(each)
+            else:
+                answers += self._answer(each.robot, each.sender, decision)
+        return answers, left
+
+    def _merge_now(self, group: list[_Waiting], start: float) -> list[Answer]:
+        """Merge messages that count; return their acknowledgements and the new version."""
+        received = join([each.received for each in group])
         sizes = [len(each.received.offset) for each in group]
         ends = torch.tensor(sizes).cumsum(0).tolist()
         new_cells = received.windows.is_new.flatten(1).sum(1)
 
         def note(alignment: Alignment) -> dict[str, Any]:
             return {
-                each.robot: _note(each.sender, alignment, new_cells.tolist(), slice(end - size, end))
+                each.robot: note_of(each.sender, alignment, new_cells.tolist(), slice(end - size, end))
                 for each, size, end in zip(group, sizes, ends, strict=True)
             }
 
@@ -236,71 +255,34 @@ class SiteServer:
             numbers = int(new_cells.sum()), int(report.contradictions.sum())
             self.on_merge(Merged([each.robot for each in group], *numbers, self.site.version, seconds))
         parts = [
-            self._acknowledge(each.robot, self.site.notes[each.robot], _slice(report, end - size, end))
+            self._answers.acknowledge(each.robot, _slice(report, end - size, end))
             for each, size, end in zip(group, sizes, ends, strict=True)
         ]
-        return [*parts, self._announce()]
-
-    # Answers --------------------------------------------------------------------------------------------------------
-
-    def _describe(self) -> dict[str, Any]:
-        """Return what each answer says of the site."""
-        return {"site": self.site.id, "version": self.site.version, "time": self.site.time}
-
-    def _sign(self, robot: str, header: Mapping[str, Any]) -> Answer:
-        return Answer(robot, encode(header, key=None if self._keys is None else self._keys.get(robot)))
-
-    def _welcome(self, robot: str, header: Mapping[str, Any]) -> Answer:
-        own = {"kind": "welcome", "link": take_text(header, "link", 64), "resolution": self.site.resolution}
-        return self._sign(robot, own | self._describe() | {"epoch": next_epoch(self.site.notes.get(robot))})
-
-    def _acknowledge(self, robot: str, note: Mapping[str, Any], contradictions: list[int] | None = None) -> Answer:
-        """Acknowledge a robot's last merge; repeated, the contradictions are not known any more: -1."""
-        counts = [-1] * len(note["offset"]) if contradictions is None else contradictions
-        return self._sign(robot, {"kind": "merged", **note, "contradictions": counts} | self._describe())
-
-    def _refuse(self, robot: str, about: Mapping[str, Any], reason: str, text: str) -> Answer:
-        self.counts["refused"] += 1
-        return self._sign(robot, {"kind": "refused", **about, "reason": reason, "text": text} | self._describe())
-
-    def _announce(self) -> Answer:
-        return Answer(None, encode({"kind": "version"} | self._describe()))
+        return [*parts, self._answers.announce()]
 
     def close(self) -> None:
         """Let other processes write to the site's folder; all that was acknowledged is on disk."""
         self.site.close()
 
 
-class _ForbiddenError(Exception):
-    """A robot may not send this. It is not answered: whoever has no key learns nothing."""
-
-
-def _about(sender: Sender) -> dict[str, Any]:
-    """Return which message a refusal is of."""
-    return {"link": sender.link, "number": sender.number}
-
-
 def _open(
-    path: str | Path | None, resolution: float | None, cfg: SiteConfig | None, device: torch.device | str
+    path: str | Path | None,
+    resolution: float | None,
+    cfg: SiteConfig | None,
+    device: torch.device | str,
+    engine: Engine | None,
 ) -> ServedSite:
     """Open a site, or make it."""
-    if path is not None and resolution is None and Path(path).is_dir() and any(Path(path).iterdir()):
+    if path is not None and resolution is None and engines.exists(path):
         site = ServedSite.open(path, cfg=cfg, device=device)
     else:
-        site = ServedSite(0.1 if resolution is None else resolution, path, cfg=cfg, device=device)
+        site = ServedSite(0.1 if resolution is None else resolution, path, cfg=cfg, device=device, engine=engine)
     try:
         site.require_heights_alone()
     except ValueError:
         site.close()
         raise
     return site
-
-
-def _note(sender: Sender, alignment: Alignment, new_cells: list[int], own: slice) -> dict[str, Any]:
-    """Return what the commit notes of a robot's message."""
-    offset, tilt, is_isolated = (value[own].tolist() for value in alignment)
-    lies = {"offset": offset, "tilt": tilt, "isolated": is_isolated}
-    return {**sender._asdict(), **lies, "new_cells": new_cells[own]}
 
 
 def _slice(report: MergeReport, start: int, end: int) -> list[int]:

@@ -83,7 +83,9 @@ def encode(
     signed = b"".join([text, *parts])
     signature = _UNSIGNED if key is None else _sign(signed, key)
     message = _PREFIX.pack(MAGIC, VERSION, signature, len(text)) + signed
-    _require(len(message) <= MAX_MESSAGE, f"{len(message)} bytes, more than {MAX_MESSAGE}")
+    if len(message) > MAX_MESSAGE:
+        text = f"message: must have at most {MAX_MESSAGE} bytes, got {len(message)}"
+        raise MessageError(f"{text}; send fewer or smaller windows")
     return message
 
 

@@ -1,4 +1,4 @@
-"""What a robot still has to send: one message at a time, each until it is acknowledged. No threads, no network.
+"""What a robot still has to send: one message at a time, each until it is acknowledged.
 
 Snapshots of which none has been sent become one: a later one holds all that an earlier one knew, except for the cells
 that have left the window since, which wait apart. So a robot that stands for an hour without a connection keeps one
@@ -20,7 +20,7 @@ from torchelev.errors import require
 from torchelev.site.fusion.merge import MergeReport
 from torchelev.site.fusion.windows import Alignment, Contribution, Windows, drop_reset, move_known
 from torchelev.site.service.ledger import OTHER_SITE, TAKEN
-from torchelev.site.service.messages import MessageError, decode, encode, take_count, take_text
+from torchelev.site.service.messages import MessageError, OtherVersionError, decode, encode, take_count, take_text
 from torchelev.site.service.snapshots import Snapshot, find_left, join, make_windows
 from torchelev.site.service.windows_message import layout_of, sizes_of, to_arrays
 
@@ -148,8 +148,10 @@ class Outbox:
         if self._flight is None and not self._take_off():
             return None
         self._wait_from(now)
-        if self._payload is None:
-            self._payload = self._encode()
+        try:
+            self._payload = self._payload or self._encode()
+        except MessageError as error:
+            self.error = RefusedError(f"robot {self.robot}: {error}")
         return self._payload
 
     def hurry(self) -> None:
@@ -220,6 +222,9 @@ class Outbox:
                 return False
             taken = {"welcome": self._welcome, "merged": self._land, "refused": self._refuse}.get(kind)
             return taken is not None and taken(header, now)
+        except OtherVersionError as error:
+            self.error = RefusedError(f"robot {self.robot}: {error}")
+            return True
         except (MessageError, KeyError, TypeError, ValueError):
             return False
 

@@ -5,13 +5,15 @@ from __future__ import annotations
 import time
 import uuid
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from torchelev.site.service.access import check_name
-from torchelev.site.service.merger import Answer, SiteServer
-from torchelev.site.service.transport import ENDPOINT, MergerToken, import_zenoh, open_session
+from torchelev.site.service.answers import Answer
+from torchelev.site.service.merger import SiteServer
+from torchelev.site.service.transport import ENDPOINT, MergerToken, as_list, import_zenoh, open_session
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -51,6 +53,9 @@ class NetworkedServer:
         self.server, self._root = server, f"torchelev/{check_name('site', site)}"
         if listen is None and connect is None and config is None:
             listen = ENDPOINT
+        given = (*as_list(listen or ()), *as_list(connect or ()))
+        #: where it listens and what it connects to, as given
+        self.endpoints = " ".join(given if config is None else (*given, str(config)))
         self._session = open_session("router", listen, connect, config) if session is None else session
         self._owns, self._declared = session is None, []  # type: bool, list[Any]
         try:
@@ -68,8 +73,10 @@ class NetworkedServer:
     def _ask(self, query: Any) -> None:
         payload = b"" if query.payload is None else query.payload.to_bytes()
 
+        zenoh = import_zenoh()
+
         def answer(found: bytes) -> None:
-            with query:
+            with suppress(zenoh.ZError), query:  # whoever asked has left
                 query.reply(str(query.key_expr), found)
 
         self.server.ask(payload, answer)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -11,7 +12,7 @@ from torchelev.errors import require
 from torchelev.site.fusion.merge import MergeReport, merge_windows
 from torchelev.site.fusion.windows import Alignment
 from torchelev.site.service.windows_message import Received
-from torchelev.site.site_map import SiteMap
+from torchelev.site.site_map import SiteMap, describe_merge
 
 if TYPE_CHECKING:
     from torchelev.site.fusion.windows import Windows
@@ -45,6 +46,10 @@ class ServedSite(SiteMap):
         """What the last commit notes of each robot."""
         return self._robots
 
+    def turn(self) -> AbstractContextManager[None]:
+        """Keep other writers of a folder out until the end of the block, and show the newest version."""
+        return self._turn()
+
     @torch.inference_mode(False)
     @torch.no_grad()
     def merge_received(self, received: Received, make_notes: MakeNotes, *, align: bool, tilt: bool) -> MergeReport:
@@ -57,7 +62,8 @@ class ServedSite(SiteMap):
             tilt: also find how they tilt.
 
         Raises:
-            OSError: the disk is full; the site is as it was before.
+            Overtaken: another writer has changed the same tiles or notes since the turn began; nothing is stored.
+            OSError: the disk is full or the store cannot be reached; `refresh` shows whether it is stored.
         """
         self._require_writable()
         windows, latest = received.windows, float(received.windows.known.now.max())
@@ -69,15 +75,18 @@ class ServedSite(SiteMap):
         alignment = _keep_last(self._align(windows, align, tilt), received, align)
         parts = merge_windows(self._tiles, windows, alignment, self.resolution, self._clock.rate, self.cfg)
         before, self._robots = self._robots, {**self._robots, **make_notes(alignment)}
-        number = self._num_commits
+        number, new_cells = self._num_commits, windows.is_new.flatten(1).sum(1)
+        history = describe_merge(len(new_cells), int(new_cells.sum()))
         try:
-            contradictions = self._write(parts, max(self._time, latest - self._epoch), len(alignment.offset))
+            time = max(self._time, latest - self._epoch)
+            contradictions = self._write(parts, time, len(new_cells), note=history)
         except BaseException:
             if self._num_commits == number:
                 self._robots = before
             raise
+        self._compact_in_time()
         self._raise_interrupted()
-        return MergeReport(*alignment, windows.is_new.flatten(1).sum(1), contradictions)
+        return MergeReport(*alignment, new_cells, contradictions)
 
 
 def _since(epoch: float, windows: Windows) -> Windows:
