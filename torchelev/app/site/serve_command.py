@@ -92,7 +92,7 @@ def run_serve(request: ServeRequest) -> None:
                 connect=request.connect or None,
                 config=request.zenoh_config,
             ) as network:
-                click.echo(f"serving   {request.path} as {request.name}  {' '.join(network.locators)}")
+                click.echo(f"serving   {request.path} as {request.name}  {network.endpoints}")
                 network.run(ended.is_set, lambda error: click.echo(f"warning: {error}", err=True))
             click.echo(f"closed    version {server.site.version}  {_describe(server.counts)}")
 

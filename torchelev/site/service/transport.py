@@ -80,16 +80,15 @@ def open_session(
         own = {"mode": mode, "scouting/multicast/enabled": False, "scouting/gossip/enabled": False}
         given = {"listen/endpoints": listen, "connect/endpoints": connect}
         own = {} if config is not None else own | {name: [] for name in given}
-        own |= {name: _as_list(value) for name, value in given.items() if value is not None}
+        own |= {name: as_list(value) for name, value in given.items() if value is not None}
         for name, value in own.items():
             settings.insert_json5(name, json.dumps(value))
         if config is None:
             settings.insert_json5("connect/exit_on_failure", "false")
             settings.insert_json5("connect/timeout_ms", "-1")
     except zenoh.ZError as error:
-        raise ValueError(
-            message("zenoh", "must be a configuration of Zenoh", _short(error), "see its manual")
-        ) from error
+        where = "endpoints" if config is None else str(config)
+        raise ValueError(message(where, "must be those of Zenoh", _short(error), "see its manual")) from error
     try:
         return zenoh.open(settings)
     except zenoh.ZError as error:
@@ -97,7 +96,8 @@ def open_session(
         raise OSError(message("listen", f"must be free endpoints, such as {ENDPOINT}", _short(error), hint)) from error
 
 
-def _as_list(value: str | Sequence[str]) -> list[str]:
+def as_list(value: str | Sequence[str]) -> list[str]:
+    """Return one or several endpoints as a list."""
     return [value] if isinstance(value, str) else list(value)
 
 
