@@ -84,8 +84,8 @@ def encode(
     signature = _UNSIGNED if key is None else _sign(signed, key)
     message = _PREFIX.pack(MAGIC, VERSION, signature, len(text)) + signed
     if len(message) > MAX_MESSAGE:
-        text = f"message: must have at most {MAX_MESSAGE} bytes, got {len(message)}"
-        raise MessageError(f"{text}; send fewer or smaller windows")
+        rule = f"must have at most {MAX_MESSAGE} bytes, got {len(message)}"
+        raise MessageError(f"message: {rule}; send fewer or smaller windows")
     return message
 
 
