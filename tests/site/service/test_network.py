@@ -2,6 +2,8 @@
 
 import contextlib
 import signal
+import subprocess
+import sys
 import threading
 import time
 import warnings
@@ -10,6 +12,7 @@ import pytest
 import torch
 
 from tests.helpers import pose, wait_for
+from tests.processes import ROOT
 from tests.site.helpers import known_cells
 from tests.site.service.processes import KILLED, Cable, MergerProcess
 from tests.site.service.walks import START, Walker, assert_same
@@ -261,6 +264,19 @@ def test_a_robot_is_told_why_it_is_refused(port):
             link.flush()
         with pytest.raises(RefusedError):
             link.publish()
+
+
+@pytest.mark.slow(4)
+@pytest.mark.parametrize("kind", ["robot", "merger"])
+def test_a_program_that_closes_nothing_ends(port, kind):
+    """Python waits at its end for threads of Zenoh that call functions, if they are asked for."""
+    start = {
+        "robot": "from torchelev import ElevationMap as E; link = RobotLink(E(), 'a', connect=at); link.publish()",
+        "merger": "network = NetworkedServer(SiteServer(None), listen=at)",
+    }
+    code = f"from torchelev.site.service import *; at = 'tcp/127.0.0.1:{port}'; {start[kind]}; print('end', flush=True)"
+    ended = subprocess.run([sys.executable, "-c", code], cwd=ROOT, timeout=60, capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout) == (0, "end\n"), ended.stderr
 
 
 @pytest.mark.slow(1)

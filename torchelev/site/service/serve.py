@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from torchelev.site.service.access import check_name
 from torchelev.site.service.answers import Answer
 from torchelev.site.service.merger import SiteServer
-from torchelev.site.service.transport import ENDPOINT, MergerToken, as_list, import_zenoh, open_session
+from torchelev.site.service.transport import ENDPOINT, MergerToken, as_list, calling, import_zenoh, open_session
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -64,8 +64,8 @@ class NetworkedServer:
             self._close_session()
             raise
         declare = self._session.declare_subscriber
-        self._declared = [declare(f"{self._root}/windows/*", self._take)]
-        self._declared.append(self._session.declare_queryable(f"{self._root}/areas", self._ask, complete=True))
+        self._declared = [declare(f"{self._root}/windows/*", calling(self._take))]
+        self._declared.append(self._session.declare_queryable(f"{self._root}/areas", calling(self._ask), complete=True))
 
     def _take(self, sample: Any) -> None:
         self.server.handle(sample.payload.to_bytes(), str(sample.key_expr).rsplit("/", 1)[1])

@@ -13,6 +13,7 @@ Sessions listen on and connect to the loopback alone unless told otherwise, and 
 
 from __future__ import annotations
 
+import atexit
 import json
 import threading
 from collections.abc import Callable, Sequence
@@ -90,10 +91,23 @@ def open_session(
         where = "endpoints" if config is None else str(config)
         raise ValueError(message(where, "must be those of Zenoh", _short(error), "see its manual")) from error
     try:
-        return zenoh.open(settings)
+        session = zenoh.open(settings)
+        atexit.register(_close, session)  # an open session may keep Python from ending
+        return session
     except zenoh.ZError as error:
         hint = "is another merger or router running there? choose another endpoint, or connect to it"
         raise OSError(message("listen", f"must be free endpoints, such as {ENDPOINT}", _short(error), hint)) from error
+
+
+def calling(function: Callable[[Any], None]) -> Any:
+    """Return a handler that calls a function in Zenoh's threads: in others, Python would wait for them at its end."""
+    return import_zenoh().handlers.Callback(function, indirect=False)
+
+
+def _close(session: Any) -> None:
+    """Close a session, unless it is closed."""
+    if not session.is_closed():
+        session.close()
 
 
 def as_list(value: str | Sequence[str]) -> list[str]:
@@ -140,9 +154,9 @@ class ZenohChannel:
                 on_merger()
 
         keys = ["versions"] + ([] if self._robot is None else [f"answers/{self._robot}"])
-        self._declared = [self._session.declare_subscriber(f"{self._root}/{key}", take) for key in keys]
+        self._declared = [self._session.declare_subscriber(f"{self._root}/{key}", calling(take)) for key in keys]
         live = self._session.liveliness()
-        self._declared.append(live.declare_subscriber(f"{self._root}/merger/*", see, history=True))
+        self._declared.append(live.declare_subscriber(f"{self._root}/merger/*", calling(see), history=True))
 
     def send(self, payload: bytes) -> None:
         """Send a message to the merger; waits while the network takes no more."""
@@ -186,7 +200,7 @@ class MergerToken:
         require(not others, "site", f"must have one merger, and {site} has one already", others[0] if others else "",
                 "end the other one, or give this site another --name", OSError)  # fmt: skip
         self._token = live.declare_token(f"{root}/{self._own}")
-        self._watcher = live.declare_subscriber(f"{root}/*", self._see, history=True)
+        self._watcher = live.declare_subscriber(f"{root}/*", calling(self._see), history=True)
 
     def _see(self, sample: Any) -> None:
         zenoh = import_zenoh()
