@@ -224,9 +224,9 @@ def test_a_robot_may_not_write_for_another_one_if_there_are_keys(port):
     walker.step()
     with serving(port, server), contextlib.ExitStack() as stack:
         for robot, key in (("a", keys["b"]), ("a", None), ("c", keys["a"])):
-            link = stack.enter_context(RobotLink(walker.emap, robot, connect=at, key=key))
-            link.publish(walker.time)
-            assert not link.flush(0.5) and len(server.site) == 0
+            with RobotLink(walker.emap, robot, connect=at, key=key) as link:  # which sends again until it is closed
+                link.publish(walker.time)
+                assert not link.flush(0.5) and len(server.site) == 0
         assert server.counts["refused"] >= 3
         own = stack.enter_context(RobotLink(walker.emap, "a", connect=at, key=keys["a"]))
         own.publish(walker.time)
