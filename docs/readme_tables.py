@@ -51,7 +51,7 @@ from benchmarks.speed import (
 )
 from benchmarks.speed import levels as levels_speed
 from benchmarks.speed.postprocessing import __main__ as postprocessing
-from benchmarks.speed.site import site_area, site_merge, site_ranks, site_service
+from benchmarks.speed.site import site_area, site_engines, site_merge, site_ranks, site_service
 from benchmarks.speed.update import tables
 from torchelev.app.results import markdown_table
 from training.completion import edges
@@ -187,6 +187,7 @@ TABLES = {
     "odometry": _made_by(odometry.table, "odometry"),
     "bags": _made_by(bags.table, "bags", "rows"),
     "live_view": _made_by(live_view.table, "live_view"),
+    "site_engines": _made_by(site_engines.table, "site_engines", "rows"),
     "site_merge": _made_by(site_merge.table, "site_merge", "rows"),
     "site_area": _made_by(site_area.table, "site_area", "rows"),
     "site_ranks": _made_by(site_ranks.table, "site_ranks"),

@@ -85,7 +85,7 @@ def classes():
     return found
 
 
-def is_member(owner, name, depth=4):
+def is_member(owner, name, depth=6):
     """Whether a class has a member, of its own or of a base."""
     words = classes().get(owner, ())
     return depth > 0 and (name in words or any(is_member(base, name, depth - 1) for base in words if base in classes()))

@@ -14,7 +14,8 @@ BAD_INPUT, EMPTY_MAP = 2, 3  # exit codes
 # The extra of torchelev that installs a package.
 _EXTRAS = {
     "rosbags": "bags", "mcap": "bags", "av": "video", "viser": "view", "trimesh": "view", "tensorstore": "site",
-    "kiss_icp": "odometry", "zenoh": "serve", "onnxruntime": "deploy",
+    "icechunk": "site", "zarr": "site", "zenoh": "serve",
+    "kiss_icp": "odometry", "onnxruntime": "deploy", "tifffile": "geo", "rasterio": "geo",
 }  # fmt: skip
 
 
@@ -60,5 +61,7 @@ def user_errors() -> Iterator[None]:
     except ModuleNotFoundError as error:
         extra = _EXTRAS.get(str(error.name).split(".")[0], "io")
         raise UserError(f"{error}; install it with pip install 'torchelev[{extra}]'") from error
+    except KeyError as error:  # whose text is its argument's repr
+        raise UserError(error.args[0] if error.args else error) from error
     except (RecordingError, ValueError, OSError) as error:
         raise UserError(error) from error

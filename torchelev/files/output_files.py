@@ -40,16 +40,24 @@ def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
         WriteError: if `path` is a folder or a device, its folder does not exist, or writing fails. The temporary file
             is removed then, and an older file is unchanged.
     """
+    with atomic_path(path) as unfinished, unfinished.open("xb") as file:
+        yield file
+
+
+@contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """Yield the path of a temporary file for a block that writes it by name; otherwise as `atomic_file`."""
     target = _resolve(path)
     unfinished = _name_temporary(target)
     try:
-        with unfinished.open("xb") as file:
-            yield file
-            file.flush()
+        yield unfinished
+        with unfinished.open("r+b") as file:
             os.fsync(file.fileno())  # some file systems report a full disk only here
         if target.exists():
             unfinished.chmod(stat.S_IMODE(target.stat().st_mode))
         os.replace(unfinished, target)
+    except WriteError:
+        raise
     except OSError as error:
         raise WriteError(path, _describe(error)) from error
     finally:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-from xml.sax.saxutils import escape
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
+from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchelev.channels.config import ChannelConfig
 from torchelev.errors import require
-from torchelev.files.output_files import atomic_file
+from torchelev.files.output_files import MARK, atomic_file
 from torchelev.io.export import take
 
 if TYPE_CHECKING:
@@ -24,6 +26,7 @@ _MODEL_TYPE, _RASTER_TYPE, _PROJECTED_CRS = 1024, 1025, 3072
 _PROJECTED, _PIXEL_IS_AREA = 1, 1
 _SHORT, _DOUBLE, _ASCII = 3, 12, 2
 _COLORS = ("Red", "Green", "Blue")
+_MAX_CLASSIC = 2**32 - 2**25  # bytes of the values, beyond which offsets need 64 bits
 
 
 def save_geotiff(
@@ -59,11 +62,12 @@ def save_geotiff(
     channels = {name: cfg.components(name) for name, cfg in emap.cfg.channels.items()}
     names = [part for name in (emap.layers if layers is None else layers) for part in channels.get(name, (name,))]
     taken = take(emap, env, names)
-    bands = np.stack([np.flipud(taken.layers[name].T) for name in names]).astype(np.float32)
+    values = np.stack([np.flipud(taken.layers[name].T) for name in names]).astype(np.float32)
     x_min, _, _, y_max = taken.extent
     north_west = x_min + origin[0], y_max + origin[1]
-    roles = color_roles(emap.cfg.channels)
-    write_bands(path, bands, bands.shape[1:], names, taken.resolution, north_west, epsg, colors=roles)
+    bands = Bands(names, values.shape[1:], taken.resolution, north_west, epsg, color_roles(emap.cfg.channels))
+    with atomic_file(path) as file:
+        encode_bands(file, values, bands)
 
 
 def color_roles(channels: Mapping[str, ChannelConfig]) -> dict[str, str]:
@@ -80,52 +84,53 @@ def check_epsg(epsg: object) -> None:
     require(is_code, "epsg", "must be the code of a projected system, 1024 to 32767", repr(epsg), "give 32632, say")
 
 
-def write_bands(
-    path: str | Path,
-    bands: NDArray[np.float32] | Iterator[NDArray[np.float32]],
-    shape: tuple[int, ...],
-    names: Sequence[str],
-    resolution: float,
-    north_west: tuple[float, float],
-    epsg: int | None,
-    block: int | None = None,
-    colors: Mapping[str, str] | None = None,
+class Bands(NamedTuple):
+    """L bands of one size, and where they lie."""
+
+    names: Sequence[str]  #: of the bands
+    shape: tuple[int, ...]  #: rows, columns
+    resolution: float  #: [m]
+    north_west: tuple[float, float]  #: easting and northing [m] of the first pixel's outer corner
+    epsg: int | None  #: code of the projected coordinate system; None: none is written
+    colors: Mapping[str, str]  #: Red, Green or Blue of the bands, by name, that hold colours
+    items: Mapping[str, str] = MappingProxyType({})  #: further metadata of the file, by name
+    date: str | None = None  #: "YYYY:MM:DD HH:MM:SS" in UTC
+
+
+def encode_bands(
+    file: BinaryIO, values: NDArray[np.float32] | Iterator[NDArray[np.float32]], bands: Bands, block: int | None = None
 ) -> None:
-    """Write bands as a GeoTIFF, rows from north to south.
+    """Write bands to an open file as a GeoTIFF, rows from north to south, NaN where unknown.
 
     Args:
-        path: of the file.
-        bands: (L, rows, columns), or its blocks of block x block pixels: all of the first band, row by row, and so on.
-        shape: rows, columns.
-        names: of the L bands.
-        resolution: [m].
-        north_west: easting and northing [m] of the first pixel's outer corner.
-        epsg: code of the projected coordinate system; None: none is written.
-        block: pixels on the side of a block, a multiple of 16; None: `bands` is an array.
-        colors: Red, Green or Blue of the bands, by name, that hold colours.
+        file: open for writing.
+        values: (L, rows, columns), or its blocks of block x block pixels: all of the first band, row by row, and so on.
+        bands: their names and place.
+        block: pixels on the side of a block, a multiple of 16; None: `values` is an array.
     """
     import tifffile
 
-    tags = _make_tags(_describe(names, colors or {}), resolution, north_west, epsg)
-    options: dict[str, Any] = dict(photometric="minisblack", metadata=None, shape=(len(names), *shape))
-    if len(names) > 1:
+    options: dict[str, Any] = dict(photometric="minisblack", metadata=None, shape=(len(bands.names), *bands.shape))
+    if len(bands.names) > 1:
         options["planarconfig"] = "separate"
     if block is not None:
         options.update(tile=(block, block), maxworkers=1)  # in one thread, so that few blocks wait in memory
-    with atomic_file(path) as file:
-        tifffile.imwrite(file, bands, dtype=np.float32, compression="zlib", extratags=tags, **options)
+    if 6 * math.prod(options["shape"]) > _MAX_CLASSIC:  # with overviews
+        options["bigtiff"] = True
+    options |= dict(datetime=bands.date, software=MARK, compression="zlib", extratags=_make_tags(bands))
+    tifffile.imwrite(file, values, dtype=np.float32, **options)
 
 
-def _make_tags(description: str, resolution: float, north_west: tuple[float, float], epsg: int | None) -> list:
-    keys = {_MODEL_TYPE: _PROJECTED, _RASTER_TYPE: _PIXEL_IS_AREA}
+def _make_tags(bands: Bands) -> list:
+    keys, resolution = {_MODEL_TYPE: _PROJECTED, _RASTER_TYPE: _PIXEL_IS_AREA}, bands.resolution
     crs = (
-        [] if epsg is None else [_geo_keys({**keys, _PROJECTED_CRS: epsg})]
+        [] if bands.epsg is None else [_geo_keys({**keys, _PROJECTED_CRS: bands.epsg})]
     )  # GDAL makes a coordinate system of any keys
     return [
         *crs,
         (_PIXEL_SCALE, _DOUBLE, 3, (resolution, resolution, 0.0), True),
-        (_TIE_POINT, _DOUBLE, 6, (0.0, 0.0, 0.0, *north_west, 0.0), True),
-        (_GDAL_METADATA, _ASCII, 0, description, True),
+        (_TIE_POINT, _DOUBLE, 6, (0.0, 0.0, 0.0, *bands.north_west, 0.0), True),
+        (_GDAL_METADATA, _ASCII, 0, _describe(bands), True),
         (_GDAL_NODATA, _ASCII, 0, "nan", True),
     ]
 
@@ -138,9 +143,11 @@ def _geo_keys(keys: dict[int, int]) -> tuple:
     return _GEO_KEYS, _SHORT, len(numbers), tuple(numbers), True
 
 
-def _describe(names: Sequence[str], colors: Mapping[str, str]) -> str:
-    """Return the names of the bands, and which of them are colours, as GDAL writes them."""
-    items = [
+def _describe(bands: Bands) -> str:
+    """Return further items, the names of the bands, and which of them are colours, as GDAL writes them."""
+    names, colors = bands.names, bands.colors
+    items = [f"<Item name={quoteattr(name)}>{escape(text)}</Item>" for name, text in bands.items.items()]
+    items += [
         f'<Item name="DESCRIPTION" sample="{k}" role="description">{escape(name)}</Item>'
         for k, name in enumerate(names)
     ]

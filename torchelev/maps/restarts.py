@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
@@ -16,7 +18,7 @@ from torchelev.maps.readable import ReadableMap
 from torchelev.pipeline import rate, write
 from torchelev.stages.disagreement.stage import add_disagreement, subtract_disagreement
 from torchelev.stages.initialize import METHODS, Site, initialize
-from torchelev.state import MapState, forget, forget_cells
+from torchelev.state import MapState, forget, forget_cells, map_layers
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -111,20 +113,23 @@ class RestartableMap(PaintedMap, ReadableMap):
 
     def initialize_from(
         self,
-        site: Site,
+        site: Site | str | Path,
         T_map_base: Float[Tensor, "B 4 4"] | None = None,
         *,
         env_ids: Int[Tensor, "K"] | None = None,
         mask: Bool[Tensor, "B"] | None = None,
     ) -> None:
-        """Start with what a site knows: heights, their variances at their present age, and upper bounds.
+        """Start with what a site knows: heights, their variances at their present age, and upper bounds; or a raster.
 
         Only unknown cells are filled, and what comes from the site does not count as measured when it is merged back.
+        Heights of a raster do: a map that merges into a site takes them from there, see `SiteMap.import_raster`. They
+        get the raster's variance, and the first measurement that contradicts one replaces it.
         A map with levels gets those of a site with levels, and chooses its ground by its first update with T_map_base.
         Heights are the site's; those of a robot that has merged since its last `reset` are raised by its offset.
 
         Args:
-            site: a `torchelev.site.SiteMap` of the same resolution.
+            site: a `torchelev.site.SiteMap` of the same resolution; a `torchelev.io.rasters.Raster`; or the path of a
+                file that `Raster.open` takes as it is, in the map frame.
             T_map_base: poses of the robots, on which their windows are centred first, (B, 4, 4). None: they stay.
             env_ids: environments to fill, int64, none twice; None: all.
             mask: True for the environments to fill, in place of `env_ids`.
@@ -132,16 +137,31 @@ class RestartableMap(PaintedMap, ReadableMap):
         Raises:
             TypeError: if an argument has the wrong type or dtype.
             ValueError: if the site has another resolution, an id is out of range or repeated, a shape or device is
-                wrong, or both ids and a mask are given. Nothing has changed then.
+                wrong, or both ids and a mask are given; or as of `Raster.open`. Nothing has changed then.
         """
-        require(hasattr(site, "fill_state"), "site", "must be a SiteMap", type(site).__name__, "give one", TypeError)
+        source = _open(site)
         if T_map_base is not None:
             shape = (self.num_envs, 4, 4)
             T_map_base = checks.check_pose("T_map_base", T_map_base, shape, self.device, self.check_values)
         chosen = self._choose(*self._check_choice(env_ids, mask))
         self._derived.clear()
         with torch.no_grad():
+            before = map_layers(Tensor.clone, self.state)
             write(self.state, subtract_disagreement(self.state))
-            state = site.fill_state(self, T_map_base, chosen)
+            try:
+                state = source.fill_state(self, T_map_base, chosen)
+            except BaseException:
+                write(self.state, before)
+                raise
             write(self.state, rate(add_disagreement(state), self.cfg, self._weights))
         self._sync_channels()
+
+
+def _open(site: Site | str | Path) -> Site:
+    """Return what fills maps, of a path the raster; TypeError for anything else, as for the folder of a site."""
+    if isinstance(site, (str, Path)) and (Path(site).suffix or Path(site, "metadata.yaml").exists()):
+        opened: Site = importlib.import_module("torchelev.io.rasters").Raster.open(site)  # files stand above maps
+        return opened
+    hint = "give one, a Raster, or the path of a .tif, an .npz or a bag"
+    require(hasattr(site, "fill_state"), "site", "must be a SiteMap", type(site).__name__, hint, TypeError)
+    return site  # type: ignore[return-value]

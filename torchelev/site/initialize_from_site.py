@@ -11,24 +11,14 @@ from torchelev.site.fusion.entries import rise
 from torchelev.site.fusion.stacks import age_stack, move_stack
 from torchelev.site.fusion.windows import Contribution, move_known
 from torchelev.stages.initialize import Remembered, recall
-from torchelev.stages.recenter.stage import follow
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
+    from jaxtyping import Bool, Int
 
     from torchelev.elevation_map import ElevationMap
 
 SUPPORT = 6.0  # points that must disagree before a height of the site is replaced
-
-
-def center_on(state: MapState, emap: ElevationMap, T_map_base: Float[Tensor, "B 4 4"], chosen: Tensor) -> MapState:
-    """Move the windows of the chosen environments to their robots."""
-    position = T_map_base[:, :3, 3].double()
-    anchor = (position[:, :2] / emap.cfg.grid.resolution).floor()
-    near = torch.cat([position[:, :2] - anchor * emap.cfg.grid.resolution, position[:, 2:]], 1)
-    near = torch.where(chosen[:, None], near, torch.nan).to(state.elevation.dtype)
-    return follow(state, near, anchor.long(), emap.cfg.grid)
 
 
 def move_contribution(

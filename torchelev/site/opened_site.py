@@ -41,6 +41,7 @@ class OpenedSite(ReadableSite):
     _num_commits: int
     _interrupted: BaseException | None
     _robots: dict[str, Any]  # what `torchelev.site.service` noted of each robot's last merge
+    _rasters: list[dict[str, Any]]
 
     @classmethod
     def open(
@@ -86,7 +87,7 @@ class OpenedSite(ReadableSite):
         self._tiles = Tiles(self._store, self.cfg.cache_tiles, device, channels, levels)
         self._id, self._rate = uuid.uuid4().hex, self.cfg.variance_rate
         self._epoch = self._time = self._opened = 0.0  # the last two count from the first
-        self._num_commits, self._interrupted, self._robots = 0, None, {}
+        self._num_commits, self._interrupted, self._rasters, self._robots = 0, None, [], {}
         self._rollbacks: list[list[int]] = []
         self._read_attributes()
 
@@ -131,7 +132,7 @@ class OpenedSite(ReadableSite):
         own = {"resolution": self.resolution, "id": self._id, "epoch": self._epoch, "time": time}
         own["num_commits"] = self._num_commits + 1
         merges = None if self._keyframes is None else self._keyframes.num_merges + new_merges
-        own["channels"] = self._tiles.channels.attributes
+        own["channels"], own["rasters"] = self._tiles.channels.attributes, self._rasters
         own |= self._tiles.levels.attributes | ({"rollbacks": self._rollbacks} if self._rollbacks else {})
         own |= {"robots": self._robots} if self._robots else {}
         return own | {"variance_rate": self._rate, "keyframe_merges": merges}
@@ -143,6 +144,7 @@ class OpenedSite(ReadableSite):
         if "num_commits" in stored:  # it has been merged into
             self._epoch, self._time = stored["epoch"], stored["time"]
             self._opened, self._num_commits = self._time, stored["num_commits"]
+            self._rasters = list(stored.get("rasters", []))
             self._rate = stored["variance_rate"] if self.cfg.variance_rate is None else self.cfg.variance_rate
             merges = stored.get("keyframe_merges")
             self._keyframes = None if merges is None else KeyframeLog(self._store, merges)

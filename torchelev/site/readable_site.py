@@ -18,7 +18,7 @@ from torchelev.grid import grid_of
 from torchelev.io.export import SavedMap
 from torchelev.layers import MODES
 from torchelev.site.reading import Clock, check_layer, check_layers, read_area, sample_tiles
-from torchelev.site.site_export import Place, choose_area, export
+from torchelev.site.site_export import Moment, Place, choose_area, export
 from torchelev.site.tiles import TILE, Tiles
 
 if TYPE_CHECKING:
@@ -42,6 +42,11 @@ class ReadableSite:
     def time(self) -> float:
         """The site's time [s]: that of the last merge. Variances and ages are read as of then."""
         return self._epoch + self._time
+
+    @property
+    def version(self) -> str:
+        """The id of the version that the site shows."""
+        raise NotImplementedError
 
     @property
     def _clock(self) -> Clock:
@@ -164,8 +169,10 @@ class ReadableSite:
     ) -> None:
         """Write an area to a file in the format of its suffix, completely or not at all.
 
-        - `.tif`: a GeoTIFF with a float32 band for each layer, NaN where unknown. Written block by block, so that
-          memory does not grow with the area. Needs ``torchelev[geo]``.
+        - `.tif`: a cloud-optimised GeoTIFF with a float32 band for each layer, NaN where unknown, and overviews whose
+          pixels are means of known ones. It names the site's version and time, SITE_VERSION and SITE_TIME [s], and has
+          the time as its date, in UTC, if that is Unix time: from 1e9 s on. Written block by block, so that memory does
+          not grow with the area. Needs ``torchelev[geo]``.
         - `.png`: a picture of one layer, shaded and coloured, transparent where unknown. Its text says which values
           the colours stand for, and the world file `.pgw` beside it where the picture lies. Needs ``torchelev[io]``.
         - `.ply`: one layer as a triangle mesh, as `torchelev.io.export.save_mesh` writes it. Needs ``torchelev[io]``.
@@ -192,6 +199,7 @@ class ReadableSite:
             path,
             choose_area(self._tiles, names, area, self.resolution, self._copy),
             Place(epsg, origin),
+            Moment(self.version, self.time),
         )
 
     def refresh(self) -> None:

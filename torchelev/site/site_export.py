@@ -7,6 +7,8 @@ import math
 import struct
 import zlib
 from collections.abc import Callable, Iterator, Sequence
+from datetime import datetime, timezone
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -15,16 +17,18 @@ import numpy as np
 from torchelev.errors import message, require
 from torchelev.files.output_files import MARK, atomic_file, require_writable
 from torchelev.io.export import SavedMap, triangulate, write_npz, write_ply
-from torchelev.io.geotiff import check_epsg, color_roles, write_bands
+from torchelev.io.geotiff import Bands, check_epsg, color_roles
+from torchelev.io.rasters.cog import BLOCK, write_cog
 from torchelev.site.reading import sources_of
 from torchelev.site.tiles import TILE, Tiles
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-_BLOCK = 256  # cells along x and y of a GeoTIFF's tiles
 _MAX_CELLS = {".png": 8192**2, ".ply": 4000**2, ".npz": 8192**2}  # which need about 3 GB of memory
-_PACKAGES = {".tif": ("tifffile", "geo"), ".png": ("cv2", "io"), ".ply": ("plyfile", "io")}  # and the extras
+# Packages, and the extras that install them.
+_PACKAGES = {".tif": (("tifffile", "rasterio"), "geo"), ".png": (("cv2",), "io"), ".ply": (("plyfile",), "io")}
+_UNIX_FROM, _UNIX_TO = 1e9, 2.5e11  # [s] from 2001 to 9892: a clock that counts from a start shows less
 _ROUNDING = 1e-6  # of a cell
 _AMBIENT = 0.35  # brightness of slopes that face away from the light
 
@@ -49,6 +53,20 @@ class Place(NamedTuple):
     origin: tuple[float, float]  #: [m] easting and northing
 
 
+class Moment(NamedTuple):
+    """The version of the site that is exported."""
+
+    version: str  #: its id
+    time: float  #: [s] of its last merge
+
+    @property
+    def date(self) -> str | None:
+        """The time as TIFF writes it, in UTC; None unless it counts from 1970, as those from 2001 on do."""
+        if not _UNIX_FROM <= self.time < _UNIX_TO:
+            return None
+        return datetime.fromtimestamp(math.floor(self.time), timezone.utc).strftime("%Y:%m:%d %H:%M:%S")
+
+
 def choose_area(
     tiles: Tiles, layers: tuple[str, ...], extent: Sequence[float] | None, resolution: float, copy: Copy
 ) -> Area:
@@ -57,20 +75,30 @@ def choose_area(
     if extent is None:
         sides = [[_find_border(tiles, layers, axis, end) for end in (False, True)] for axis in (0, 1)]
     else:
-        box = np.asarray(extent)
-        is_box = box.shape == (4,) and box.dtype.kind in "iuf" and bool(np.isfinite(box).all())
-        is_box = is_box and bool(box[0] < box[1] and box[2] < box[3])
-        require(is_box, "area", "expected x_min, x_max, y_min, y_max in metres", repr(extent), "see site.extent")
+        check_box(extent)
         cells = [value / resolution for value in extent]
         sides = [[math.floor(cells[k] + _ROUNDING), math.ceil(cells[k + 1] - _ROUNDING)] for k in (0, 2)]
     (x, x_end), (y, y_end) = sides
     return Area((x, y), (x_end - x, y_end - y), layers, resolution, copy, color_roles(tiles.channels.configs))
 
 
-def export(path: str | Path, area: Area, place: Place) -> None:
+def check_box(extent: Sequence[float]) -> None:
+    """Raise ValueError unless an extent is x_min, x_max, y_min, y_max."""
+    box = np.asarray(extent)
+    is_box = box.shape == (4,) and box.dtype.kind in "iuf" and bool(np.isfinite(box).all())
+    is_box = is_box and bool(box[0] < box[1] and box[2] < box[3])
+    require(is_box, "area", "expected x_min, x_max, y_min, y_max in metres", repr(extent), "see site.extent")
+
+
+def export(path: str | Path, area: Area, place: Place, moment: Moment) -> None:
     """Write an area to a file in the format of its suffix."""
     suffix = Path(path).suffix.lower().replace(".tiff", ".tif")
-    writers = {".tif": _write_tif, ".png": _write_png, ".ply": _write_ply, ".npz": _write_npz}
+    writers: dict[str, Callable[[str | Path, Area, Place], None]] = {
+        ".tif": partial(_write_tif, moment=moment),
+        ".png": _write_png,
+        ".ply": _write_ply,
+        ".npz": _write_npz,
+    }
     require(suffix in writers, "path", f"must end with {', '.join(writers)}", repr(str(path)), "choose one of these")
     _check_place(suffix, place)
     if suffix in (".png", ".ply"):
@@ -87,8 +115,8 @@ def _find_border(tiles: Tiles, layers: tuple[str, ...], axis: int, is_end: bool)
     for line in sorted({tile[axis] for tile in tiles}, reverse=is_end):
         chosen = [tile for tile in tiles if tile[axis] == line]
         known = np.zeros(TILE, bool)
-        for k in range(0, len(chosen), _BLOCK):
-            is_known = tiles.read(chosen[k : k + _BLOCK])[rows].isfinite().any(0)
+        for k in range(0, len(chosen), BLOCK):
+            is_known = tiles.read(chosen[k : k + BLOCK])[rows].isfinite().any(0)
             known |= is_known.any(0).any(1 - axis).cpu().numpy()
         if known.any():
             return int(line * TILE + (known.nonzero()[0][-1] + 1 if is_end else known.nonzero()[0][0]))
@@ -118,21 +146,23 @@ def _check_size(suffix: str, area: Area) -> None:
 
 def _import(suffix: str) -> None:
     """Import what the writer needs; ModuleNotFoundError says how to install it."""
-    package, extra = _PACKAGES.get(suffix, ("numpy", ""))
-    try:
-        importlib.import_module(package)
-    except ModuleNotFoundError as error:
-        text = f'{suffix} needs {package}: pip install "torchelev[{extra}]"'
-        raise ModuleNotFoundError(text, name=error.name) from error
+    packages, extra = _PACKAGES.get(suffix, ((), ""))
+    for package in packages:
+        try:
+            importlib.import_module(package)
+        except ModuleNotFoundError as error:
+            text = f'{suffix} needs {package}: pip install "torchelev[{extra}]"'
+            raise ModuleNotFoundError(text, name=error.name) from error
 
 
 # Writers --------------------------------------------------------------------------------------------------------------
 
 
-def _write_tif(path: str | Path, area: Area, place: Place) -> None:
-    north_west = _find_north_west(area, place)
-    blocks, shape = _read_blocks(area), area.size[::-1]
-    write_bands(path, blocks, shape, area.layers, area.resolution, north_west, place.epsg, _BLOCK, area.colors)
+def _write_tif(path: str | Path, area: Area, place: Place, moment: Moment) -> None:
+    north_west, shape = _find_north_west(area, place), area.size[::-1]
+    items = {"SITE_VERSION": moment.version, "SITE_TIME": repr(moment.time)}
+    about = Bands(area.layers, shape, area.resolution, north_west, place.epsg, area.colors, items, moment.date)
+    write_cog(path, _read_blocks(area), about)
 
 
 def _find_north_west(area: Area, place: Place) -> tuple[float, float]:
@@ -145,9 +175,9 @@ def _read_blocks(area: Area) -> Iterator[NDArray[np.float32]]:
     """Yield the blocks of each layer, rows from north to south, as GeoTIFF has them."""
     (x, y), (H, W) = area.corner, area.size
     for name in area.layers:
-        for north in range(y + W, y, -_BLOCK):
-            for west in range(x, x + H, _BLOCK):
-                block = area.copy((west, north - _BLOCK), (_BLOCK, _BLOCK), (name,))
+        for north in range(y + W, y, -BLOCK):
+            for west in range(x, x + H, BLOCK):
+                block = area.copy((west, north - BLOCK), (BLOCK, BLOCK), (name,))
                 yield np.ascontiguousarray(_north_up(block.layers[name]), np.float32)
 
 

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
 from torchelev.inputs import checks
+from torchelev.maps.centering import center_on
 from torchelev.ops.masks import count
 from torchelev.ops.storage import keep_freed_memory
 from torchelev.site.channels import SiteChannels
@@ -33,10 +34,11 @@ from torchelev.site.fusion.windows import (
     read_windows,
     snapshot,
 )
-from torchelev.site.initialize_from_site import add_filled, center_on, fill, move_contribution
+from torchelev.site.initialize_from_site import add_filled, fill, move_contribution
 from torchelev.site.keyframes.keyframe_log import KeyframeLog, arrays_of, changed_arrays
 from torchelev.site.keyframes.keyframes import Keyframes, Recorded, correct, record
 from torchelev.site.keyframes.rebuild import merge_recorded, rebuild_moved
+from torchelev.site.rasters.raster_site import RasterSite
 from torchelev.site.shared.collective import gather_windows, open_shared
 from torchelev.site.shared.ranks import Ranks
 from torchelev.site.site_config import SiteConfig
@@ -45,7 +47,7 @@ from torchelev.site.storage.interface import Note, Overtaken
 from torchelev.site.storage.versioned.repository import UncertainCommitError
 from torchelev.site.tiles import LAYERS, locate
 from torchelev.site.times import check_time, continue_time, warn_of_other_clock
-from torchelev.site.versioned_site import VersionedSite, contributions
+from torchelev.site.versioned_site import contributions
 from torchelev.stages.initialize import Remembered
 from torchelev.state import MapState, map_layers
 
@@ -57,7 +59,7 @@ if TYPE_CHECKING:
     from torchelev.site.storage.engines import Engine
 
 
-class SiteMap(VersionedSite):
+class SiteMap(RasterSite):
     """A world map that grows: the windows of many robots, in one frame.
 
     ```python
@@ -284,7 +286,7 @@ class SiteMap(VersionedSite):
 
     def _since_epoch(self, time: float) -> float:
         """Return a time that was given, from the epoch. The first one becomes the epoch."""
-        if len(self._tiles):
+        if self._has_clock:
             warn_of_other_clock(time, self.time)
         else:
             self._epoch, self._time = time, 0.0

@@ -99,11 +99,15 @@ def test_each_commit_is_a_version_that_stays_readable(store, path):
             commit(old, 5)
 
 
-def test_a_commit_of_nothing_makes_no_version_but_keeps_its_attributes_in_memory(store):
-    version = commit(store, 1)
-    with store.transaction({"number": 2}):
+def test_a_commit_of_nothing_but_time_makes_no_version(store, path):
+    store.commit(TILES, numbered(1), {"num_commits": 1, "time": 1.0, "epoch": 5.0})
+    version = store.version
+    with store.transaction({"num_commits": 2, "time": 2.0, "epoch": 5.0}):
         pass
-    assert store.version == version and store.attributes == {"number": 2} and len(store.versions()) == 2
+    assert store.version == version and store.attributes["time"] == 2.0 and len(store.versions()) == 2
+    with store.transaction({"num_commits": 3, "time": 2.0, "epoch": 5.0, "notes": "new"}):
+        pass
+    assert len(store.versions()) == 3 and open_store(path).attributes["notes"] == "new"
 
 
 def test_tags_name_versions(store, path):

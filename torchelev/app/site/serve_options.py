@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-_HELP = """Hold the site map PATH, and merge what robots send over Zenoh.
+_HELP = """Hold the site map SITE, and merge what robots send over Zenoh.
 
 Robots send with torchelev.site.service.RobotLink, and get what the site knows
 around them. Needs torchelev[serve].
@@ -24,7 +24,7 @@ that is under way; robots keep what they have until it runs again.
 
 
 @click.command("serve", help=_HELP, short_help="Merge what robots send over the network.")
-@click.argument("path")
+@click.argument("path", metavar="SITE")
 @click.option(
     "--resolution", type=float, metavar="M", help="Cell size of a new site [m].  [default: the site's, or 0.1]"
 )

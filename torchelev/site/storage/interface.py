@@ -65,6 +65,10 @@ class SiteStore(Protocol):
         """Names of the L layers."""
 
     @property
+    def tile_size(self) -> int:
+        """T, cells on the side of a tile."""
+
+    @property
     def attributes(self) -> dict[str, Any]:
         """Attributes of the version that it shows."""
 
@@ -89,6 +93,9 @@ class SiteStore(Protocol):
 
     def read_array(self, name: str) -> tuple[NDArray, dict[str, Any]]:
         """Read an array and its attributes."""
+
+    def array_names(self) -> list[str]:
+        """Return the sorted names of all arrays."""
 
     def transaction(
         self, attributes: Mapping[str, Any], arrays: Arrays | None = None, note: Note | None = None

@@ -37,6 +37,7 @@ from torchelev.site.storage.versioned.repository import (
 )
 
 _WAIT = 120.0  # [s] for other writers of a folder
+_MARK = "history/mark"  # an array that changes where attributes alone do: a commit has to change something
 _GROUPS = ("keyframes", "merges")  # made at the start: two writers that made one each could not both commit
 
 
@@ -262,12 +263,20 @@ class VersionedStore:
             for failure in failures:
                 if failure is not None:
                     raise failure
-            if not (written or arrays):  # a merge of nothing new makes no version
-                self._header = header
-                return
+            if not (written or arrays):
+                if self._differs_in_time_alone(header):  # a merge of nothing new makes no version
+                    self._header = header
+                    return
+                arrays = {_MARK: (np.array(header.attributes.get("num_commits", 0)), {})}
             for name, (array, own) in (arrays or {}).items():
                 named.write_array(session.store, name, array, own)
             self._commit(session, header, written, note or Note(f"{len(written)} tile{'s' * (len(written) != 1)}"))
+
+    def _differs_in_time_alone(self, header: Header) -> bool:
+        """Return whether a header says nothing new but the time and number of a merge."""
+        before, after = self._header.attributes, header.attributes
+        changed = {name for name in {*before, *after} if before.get(name) != after.get(name)}
+        return changed <= {"time", "num_commits"}
 
     def _commit(self, session: Any, header: Header, written: set[Tile], note: Note) -> None:
         """Commit a session, and show what it left."""
