@@ -83,7 +83,8 @@ class Outbox:
         self._flight: _Flight | None = None
         self._payload: bytes | None = None
         self._offset: Tensor | None = None
-        self._due, self._retry, self._other_since = 0.0, _FIRST_RETRY, None  # type: float, float, float | None
+        self._due, self._retry = 0.0, _FIRST_RETRY
+        self._other_since: float | None = None
 
     @property
     def is_empty(self) -> bool:
@@ -117,7 +118,7 @@ class Outbox:
         joined = None if last is None else join(last, part)
         if joined is not None:
             self._left.pop()
-        part = part if joined is None else joined
+            part = joined
         self._left.append(_Left(part.known.corner, part.known.is_known, part))
         while self.waiting_bytes > self.max_waiting:
             self._drop_oldest()
@@ -125,10 +126,8 @@ class Outbox:
     def _drop_oldest(self) -> None:
         """Give up the oldest part that waits, and say so."""
         k = next(k for k, left in enumerate(self._left) if left.part is not None)
-        part = self._left[k].part
-        assert part is not None
+        self.dropped_cells += int(self._left[k].part.counts.sum())  # type: ignore[union-attr]
         self._left[k] = self._left[k]._replace(part=None)
-        self.dropped_cells += int(part.counts.sum())
         text = f"robot {self.robot}: more than {self.max_waiting >> 20} MiB wait for the site's merger; "
         warnings.warn(text + f"{self.dropped_cells} cells were given up, the oldest ones", RuntimeWarning, stacklevel=5)
 

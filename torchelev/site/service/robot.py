@@ -14,9 +14,10 @@ from torch import Tensor
 
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
+from torchelev.maps.centering import center_on
 from torchelev.site.fusion.merge import MergeReport
 from torchelev.site.fusion.windows import Known, no_contribution, read_known
-from torchelev.site.initialize_from_site import add_filled, center_on, fill, move_contribution
+from torchelev.site.initialize_from_site import add_filled, fill, move_contribution
 from torchelev.site.service.access import check_key, check_name
 from torchelev.site.service.outbox import MAX_WAITING, Outbox
 from torchelev.site.service.reader import HEIGHTS, SiteReader
