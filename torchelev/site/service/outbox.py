@@ -83,8 +83,8 @@ class Outbox:
         self._flight: _Flight | None = None
         self._payload: bytes | None = None
         self._offset: Tensor | None = None
-        self._due, self._retry = 0.0, _FIRST_RETRY
         self._other_since: float | None = None
+        self._due, self._retry = 0.0, _FIRST_RETRY
 
     @property
     def is_empty(self) -> bool:
@@ -165,10 +165,10 @@ class Outbox:
 
     def _encode(self) -> bytes:
         assert self._flight is not None
-        windows, offset = self._flight.windows, self._offset
-        offset = torch.full_like(windows.known.now, torch.nan) if offset is None else offset
-        header = self._header("windows") | {"site": self._site, "epoch": self._epoch}
-        header |= {"number": self.num_acknowledged + 1} | sizes_of(windows)
+        windows = self._flight.windows
+        offset = windows.known.now * torch.nan if self._offset is None else self._offset
+        sender = {"site": self._site, "epoch": self._epoch, "number": self.num_acknowledged + 1}
+        header = self._header("windows") | sender | sizes_of(windows)
         return encode(header, layout_of(header), to_arrays(windows, offset), self._key)
 
     def _take_off(self) -> bool:
@@ -178,8 +178,8 @@ class Outbox:
             if left.part is not None and self._fly(left.part, left):
                 return True
             self._forget(left)
-        snapshot, self._latest = self._latest, None
-        return snapshot is not None and self._fly(snapshot, None)
+        latest, self._latest = self._latest, None
+        return latest is not None and self._fly(latest, None)
 
     def _fly(self, snapshot: Snapshot, left: _Left | None) -> bool:
         windows = make_windows(snapshot, self.recall(snapshot.num_resets, snapshot.elapsed))
@@ -219,8 +219,7 @@ class Outbox:
                 return False
             if take_text(header, "link") != self._link:
                 return False
-            taken = {"welcome": self._welcome, "merged": self._land, "refused": self._refuse}.get(kind)
-            return taken is not None and taken(header, now)
+            return {"welcome": self._welcome, "merged": self._land, "refused": self._refuse}[kind](header, now)
         except OtherVersionError as error:
             self.error = RefusedError(f"robot {self.robot}: {error}")
             return True
@@ -238,9 +237,8 @@ class Outbox:
             return False
         actual = float(header["resolution"])
         if abs(actual - self.resolution) > 1e-9 * actual:
-            self.error = RefusedError(
-                f"emap: must have the site's resolution, {actual:g} m, got {self.resolution:g} m; cells must line up"
-            )
+            rule = f"must have the site's resolution, {actual:g} m, got {self.resolution:g} m"
+            self.error = RefusedError(f"emap: {rule}; cells must line up")
             return True
         self._site, self._epoch = take_text(header, "site"), take_count(header, "epoch")
         self.version = take_text(header, "version")
