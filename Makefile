@@ -8,7 +8,7 @@ PYTEST := -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
 MATRIX := 3.10 3.12 3.13
 MATRIX_TESTS := tests --ignore tests/envs --ignore tests/training --ignore tests/gym --ignore tests/benchmarks \
 	--ignore tests/test_answers.py --ignore tests/test_notebooks.py --ignore tests/test_readme.py --ignore tests/docs
-EXTRAS := io,bags,odometry,video,view,geo,site,rl,deploy,dev,docs
+EXTRAS := io,bags,odometry,video,view,geo,site,serve,rl,deploy,dev,docs
 MJLAB := .venv-mjlab
 MUJOCO := .venv-mujoco
 ISAACLAB := .venv-isaaclab

@@ -51,7 +51,7 @@ from benchmarks.speed import (
 )
 from benchmarks.speed import levels as levels_speed
 from benchmarks.speed.postprocessing import __main__ as postprocessing
-from benchmarks.speed.site import site_area, site_engines, site_merge, site_ranks
+from benchmarks.speed.site import site_area, site_engines, site_merge, site_ranks, site_service
 from benchmarks.speed.update import tables
 from torchelev.app.results import markdown_table
 from training.completion import edges
@@ -191,6 +191,7 @@ TABLES = {
     "site_merge": _made_by(site_merge.table, "site_merge", "rows"),
     "site_area": _made_by(site_area.table, "site_area", "rows"),
     "site_ranks": _made_by(site_ranks.table, "site_ranks"),
+    "site_service": _made_by(site_service.table, "site_service"),
     "real_merged": _made_by(merged.table, "real_merged", "rows"),
     "completion": _made_by(filling.summary, "completion", folder=training.RESULTS),
     "completion_edges": _made_by(edges.table, edges.NAME, folder=training.RESULTS),

@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -144,8 +145,23 @@ def test_live_shows_the_site_and_the_robots(run, port, request):
     shown = request.getfixturevalue("shown")
     code, out, err = run("fleet", *SMALL[:4], "--seconds", 2, "--live", "--port", port, "--quiet")
     assert (code, err) == (0, "") and f"open      http://localhost:{port}" in out
+    assert ("merger    " in out) == bool(find_spec("zenoh") and find_spec("tensorstore"))
     assert [status[:4] for _, status in shown] == ["0 s,", "1 s,", "2 s,"]
     assert shown[-1][0].T_map_sensor.shape == (3, 4, 4) and shown[-1][0].map.layers["elevation"].shape == (120, 120)
+
+
+@pytest.mark.slow(6)
+def test_robots_send_to_a_merger_in_another_process(run, tmp_path):
+    pytest.importorskip("zenoh", reason="needs torchelev[serve]")
+    pytest.importorskip("tensorstore", reason="needs torchelev[serve]")
+    histories = []
+    for options in ("--service",), ("--no-service",):
+        code, out, err = run("fleet", *SMALL, "--quiet", "--site", options[0][2:], *options)
+        assert (code, err) == (0, "") and ("merger    a process of its own" in out) == (options[0] == "--service")
+        numbers = json.loads((tmp_path / "fleet.json").read_text())
+        assert numbers["num_bytes"] > 0 and numbers["largest_offset_error"] < 0.02
+        histories.append(numbers["history"])
+    assert np.allclose(histories[0], histories[1], atol=0.02)  # robots arrive one by one, and are aligned so
 
 
 def test_seams_are_steps_between_blocks():

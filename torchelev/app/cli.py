@@ -77,6 +77,10 @@ map, which finds these offsets from the ground that they have in common.
   torchelev fleet --site hill/                    keep the map, go on later
   torchelev fleet --live                          watch it grow in the browser
 
+With --service, each robot sends its map over the network of this machine to
+a merger in a process of its own, as of `torchelev site serve`, and what is
+shown and planned is what comes back.
+
 The mission ends when nothing is left to explore, or after --seconds. Ctrl-C
 ends it earlier and keeps what was mapped.
 
@@ -110,6 +114,11 @@ Output files:
     "Needs torchelev[site].  [default: a temporary folder]",
 )
 @click.option("--live", is_flag=True, help="Show the growing map in the browser; needs torchelev[view].")
+@click.option(
+    "--service/--no-service",
+    default=None,
+    help="Merge in another process, over Zenoh; needs torchelev[serve].  [default: with --live, if that is installed]",
+)
 @click.option(
     "--host", default="127.0.0.1", show_default=True, help="Address of --live; 0.0.0.0 lets other machines connect."
 )

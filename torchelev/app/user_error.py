@@ -14,7 +14,7 @@ BAD_INPUT, EMPTY_MAP = 2, 3  # exit codes
 # The extra of torchelev that installs a package.
 _EXTRAS = {
     "rosbags": "bags", "mcap": "bags", "av": "video", "viser": "view", "trimesh": "view", "tensorstore": "site",
-    "icechunk": "site", "zarr": "site",
+    "icechunk": "site", "zarr": "site", "zenoh": "serve",
     "kiss_icp": "odometry", "onnxruntime": "deploy", "tifffile": "geo", "rasterio": "geo",
 }  # fmt: skip
 

@@ -43,6 +43,7 @@ class OpenedSite(ReadableSite):
     _opened: float
     _num_commits: int
     _interrupted: BaseException | None
+    _robots: dict[str, Any]  # what `torchelev.site.service` noted of each robot's last merge
     _rasters: list[dict[str, Any]]
 
     @classmethod
@@ -90,7 +91,7 @@ class OpenedSite(ReadableSite):
         self._exchange = exchange_of(self._ranks)
         self._id, self._rate = uuid.uuid4().hex, self.cfg.variance_rate
         self._epoch = self._time = self._opened = 0.0  # the last two count from the first
-        self._num_commits, self._interrupted, self._rasters = 0, None, []
+        self._num_commits, self._interrupted, self._rasters, self._robots = 0, None, [], {}
         self._rollbacks: list[list[int]] = []
         self._read_attributes()
 
@@ -137,11 +138,13 @@ class OpenedSite(ReadableSite):
         merges = None if self._keyframes is None else self._keyframes.num_merges + new_merges
         own["channels"], own["rasters"] = self._tiles.channels.attributes, self._rasters
         own |= self._tiles.levels.attributes | ({"rollbacks": self._rollbacks} if self._rollbacks else {})
+        own |= {"robots": self._robots} if self._robots else {}
         return own | {"variance_rate": self._rate, "keyframe_merges": merges}
 
     def _read_attributes(self) -> None:
         stored = {} if self._store is None else self._store.attributes
         self._id, self._rollbacks = stored.get("id", self._id), stored.get("rollbacks", [])
+        self._robots = stored.get("robots", {})
         if "num_commits" in stored:  # it has been merged into
             self._epoch, self._time = stored["epoch"], stored["time"]
             self._opened, self._num_commits = self._time, stored["num_commits"]

@@ -38,6 +38,8 @@ def run_fleet(request: FleetRequest, quiet: bool = False) -> int:
         request.require_outputs()
         view, mission = open_view(request), Mission(request, folder)
         with closing(mission.site):
+            if request.is_served:
+                click.echo("merger    a process of its own, to which each robot sends over the loopback")
             is_interrupted = explore_and_report(mission, view, quiet)
         if view and not is_interrupted:
             hold(view)

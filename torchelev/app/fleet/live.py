@@ -31,7 +31,7 @@ class FleetView:
             return
         self._num_shown = len(mission.merge_ms)
         poses = mission.scan.T_map_base.numpy()
-        status = f"{mission.time:.0f} s, {100 * mission.coverage:.1f} % known"
+        status = f"{mission.time:.0f} s, {100 * mission.coverage:.1f} % known, version {mission.site.version}"
         self.page.draw(Snapshot(thin_out(mission.saved), T_map_sensor=poses, time=mission.time), status)
 
 

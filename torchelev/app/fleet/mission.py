@@ -19,6 +19,7 @@ from torchelev.grid import GridConfig
 from torchelev.site import SiteMap
 
 if TYPE_CHECKING:
+    from torchelev.app.fleet.service import FleetService
     from torchelev.io.export import SavedMap
 
 DT = 0.2  # [s] between scans
@@ -52,7 +53,7 @@ class Mission:
         self.explorer = Explorer(request.robots, request.size, request.coarse)
         grid = GridConfig(resolution=request.resolution, length_x=request.window, length_y=request.window)
         self.emap = ElevationMap(ElevationMapConfig(grid=grid), num_envs=request.robots)
-        self.site = SiteMap(resolution=request.resolution, path=folder)
+        self.site = open_site(request, self.emap, folder)
         self.time, self.coverage = 0.0, 0.0
         self.num_scans, self._num_unmerged = 0, 0
         self.saved: SavedMap | None = None
@@ -102,3 +103,15 @@ class Mission:
         assert self.saved is not None
         area = coarsen(torch.as_tensor(self.saved.layers["elevation"]), self.request.resolution)
         self.robots.follow(self.explorer.plan(area, self.robots.xy))
+
+
+def open_site(request: FleetRequest, emap: ElevationMap, folder: Path | None) -> SiteMap | FleetService:
+    """Open the site map, in this process or as a service."""
+    if not request.is_served:
+        return SiteMap(resolution=request.resolution, path=folder)
+    from torchelev.app.fleet.service import FleetService
+    from torchelev.site.storage.zarr_files import import_tensorstore
+
+    import_tensorstore()
+    assert folder is not None
+    return FleetService(emap, folder, request.seconds)

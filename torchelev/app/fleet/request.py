@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
 from torchelev.app.fleet.explore import cells_per_coarse_cell
@@ -34,6 +35,7 @@ class FleetRequest:
     out: Path = Path("fleet.png")  #: picture; the numbers lie beside it as .json
     site: Path | None = None  #: folder of the site map; None: a temporary one
     live: bool = False  #: show the site map in the browser
+    service: bool | None = None  #: robots talk to a merger in another process; None: with `live` if that is installed
     host: str = "127.0.0.1"  #: address that the page listens on
     port: int = 8080  #: of the page
 
@@ -56,6 +58,13 @@ class FleetRequest:
         require(self.size >= smallest, "--size", rule, f"{self.size:g} m", f"give {smallest} or more, or fewer robots")
         require(self.size <= _MAX_SIZE, "--size", f"must be at most {_MAX_SIZE:g} m", f"{self.size:g}", "give 60")
         whole_cells("--size", self.size, 2 * self.coarse)
+
+    @property
+    def is_served(self) -> bool:
+        """Whether the robots send their maps to a merger in another process."""
+        if self.service is None:
+            return self.live and find_spec("zenoh") is not None and find_spec("tensorstore") is not None
+        return self.service
 
     @property
     def coarse(self) -> float:

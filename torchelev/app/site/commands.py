@@ -7,6 +7,7 @@ import click
 from torchelev.app.site import version_commands
 from torchelev.app.site.export_command import export_command
 from torchelev.app.site.import_command import import_command
+from torchelev.app.site.serve_options import serve_command
 
 
 @click.group("site", short_help="Serve, list, go back to and export a site map.")
@@ -22,3 +23,4 @@ for command in version_commands.COMMANDS:
     site_command.add_command(command)
 site_command.add_command(export_command)
 site_command.add_command(import_command)
+site_command.add_command(serve_command)

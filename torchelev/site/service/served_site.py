@@ -1,0 +1,103 @@
+"""A site that merges windows which came as messages, and notes in the same commit whose they were."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from torchelev.errors import require
+from torchelev.site.fusion.merge import MergeReport, merge_windows
+from torchelev.site.fusion.windows import Alignment
+from torchelev.site.service.windows_message import Received
+from torchelev.site.site_map import SiteMap, describe_merge
+
+if TYPE_CHECKING:
+    from torchelev.site.fusion.windows import Windows
+
+MakeNotes = Callable[[Alignment], Mapping[str, Any]]
+
+
+class ServedSite(SiteMap):
+    """A `SiteMap` that merges what robots sent."""
+
+    def require_heights_alone(self) -> None:
+        """Raise ValueError if the site keeps channels, levels or keyframes, of which messages have none."""
+        kept = {"channels": bool(self._tiles.channels), "levels": self._tiles.levels.cfg is not None}
+        kept["keyframes"] = self._keyframes is not None
+        names = " and ".join(name for name, is_kept in kept.items() if is_kept)
+        hint = "merge into it in one process, with SiteMap.merge"
+        require(not names, "path", "must be a site of heights alone to be served", f"one with {names}", hint)
+
+    @property
+    def id(self) -> str:
+        """Which site this is; copies of its folder have the same."""
+        return self._id
+
+    @property
+    def rate(self) -> float:
+        """[m^2/s] at which variances grow; 0 before the first merge."""
+        return self._clock.rate
+
+    @property
+    def notes(self) -> dict[str, Any]:
+        """What the last commit notes of each robot."""
+        return self._robots
+
+    def turn(self) -> AbstractContextManager[None]:
+        """Keep other writers of a folder out until the end of the block, and show the newest version."""
+        return self._turn()
+
+    @torch.inference_mode(False)
+    @torch.no_grad()
+    def merge_received(self, received: Received, make_notes: MakeNotes, *, align: bool, tilt: bool) -> MergeReport:
+        """Fuse windows that robots sent, and note it in the same commit, or do neither.
+
+        Args:
+            received: windows of one or several robots.
+            make_notes: returns what to note of these robots, given how their windows lie.
+            align: find the windows' offsets.
+            tilt: also find how they tilt.
+
+        Raises:
+            Overtaken: another writer has changed the same tiles or notes since the turn began; nothing is stored.
+            OSError: the disk is full or the store cannot be reached; `refresh` shows whether it is stored.
+        """
+        self._require_writable()
+        windows, latest = received.windows, float(received.windows.known.now.max())
+        if self._rate is None:
+            self._rate = float(windows.known.rate[0])
+        if not len(self._tiles) and not self._robots:
+            self._epoch, self._time = latest, 0.0
+        windows = _since(self._epoch, windows)
+        alignment = _keep_last(self._align(windows, align, tilt), received, align)
+        parts = merge_windows(self._tiles, windows, alignment, self.resolution, self._clock.rate, self.cfg)
+        before, self._robots = self._robots, {**self._robots, **make_notes(alignment)}
+        number, new_cells = self._num_commits, windows.is_new.flatten(1).sum(1)
+        history = describe_merge(len(new_cells), int(new_cells.sum()))
+        try:
+            time = max(self._time, latest - self._epoch)
+            contradictions = self._write(parts, time, len(new_cells), note=history)
+        except BaseException:
+            if self._num_commits == number:
+                self._robots = before
+            raise
+        self._compact_in_time()
+        self._raise_interrupted()
+        return MergeReport(*alignment, new_cells, contradictions)
+
+
+def _since(epoch: float, windows: Windows) -> Windows:
+    """Return windows whose times count from the site's epoch [s]."""
+    known, was = windows.known, windows.contribution
+    if was is not None:
+        was = was._replace(known=was.known._replace(now=was.known.now - epoch))
+    return windows._replace(known=known._replace(now=known.now - epoch), contribution=was)
+
+
+def _keep_last(alignment: Alignment, received: Received, align: bool) -> Alignment:
+    """Return the alignment, in which isolated windows keep their last offset also if all cells have left them since."""
+    keeps = alignment.is_isolated & received.offset.isfinite()
+    return alignment._replace(offset=torch.where(keeps, received.offset, alignment.offset)) if align else alignment
