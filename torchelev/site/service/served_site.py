@@ -10,7 +10,7 @@ import torch
 
 from torchelev.errors import require
 from torchelev.site.fusion.merge import MergeReport, merge_windows
-from torchelev.site.fusion.windows import Alignment
+from torchelev.site.fusion.windows import Alignment, move_known
 from torchelev.site.service.windows_message import Received
 from torchelev.site.site_map import SiteMap, describe_merge
 
@@ -90,11 +90,12 @@ class ServedSite(SiteMap):
 
 
 def _since(epoch: float, windows: Windows) -> Windows:
-    """Return windows whose times count from the site's epoch [s]."""
-    known, was = windows.known, windows.contribution
+    """Return windows whose times count from the site's epoch [s], with what was known before moved to them."""
+    known, was, before = windows.known, windows.contribution, None
     if was is not None:
         was = was._replace(known=was.known._replace(now=was.known.now - epoch))
-    return windows._replace(known=known._replace(now=known.now - epoch), contribution=was)
+        before = move_known(was.known, known.corner)
+    return windows._replace(known=known._replace(now=known.now - epoch), contribution=was, before=before)
 
 
 def _keep_last(alignment: Alignment, received: Received, align: bool) -> Alignment:

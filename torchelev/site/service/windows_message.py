@@ -139,7 +139,8 @@ def join(parts: list[Received]) -> Received:
     )
     zero = torch.zeros(len(known.now), dtype=torch.int64)
     contribution = Contribution(before, alignment, zero, zero, zero - 1)
-    return Received(Windows(known, **layers, contribution=contribution), torch.cat([part.offset for part in parts]))
+    windows = parts[0].windows._replace(known=known, contribution=contribution, **layers)
+    return Received(windows, torch.cat([part.offset for part in parts]))
 
 
 def _contribution(windows: Windows) -> Contribution:
