@@ -130,7 +130,7 @@ def join(parts: list[Received]) -> Received:
     contributions = [_contribution(part.windows) for part in parts]
     known = Known(*map(torch.cat, zip(*(part.windows.known for part in parts), strict=True)))
     names = Windows._fields[1:7]
-    layers = {name: torch.cat([getattr(part.windows, name) for part in parts]) for name in names}
+    layers: dict[str, Any] = {name: torch.cat([getattr(part.windows, name) for part in parts]) for name in names}
     before = Known(*map(torch.cat, zip(*(each.known for each in contributions), strict=True)))
     alignment = no_alignment(len(known.now), known.now.device)
     alignment = alignment._replace(
