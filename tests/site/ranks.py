@@ -216,7 +216,7 @@ def misuse(rank, path, other):
         "disk": lambda: _with_full_disk(merge),
         "reading": lambda: _unreadable(site, merge, rank),
         "beginning": lambda: _failing(site._store, "_alone", merge, rank == 0),
-        "writing": lambda: _failing(site._store, "_writer", merge, rank == 1),
+        "writing": lambda: _failing(store, "write_tiles", merge, rank == 1),
     }
     texts |= {name: _error_of(call) for name, call in cases.items()}
     after = contents(site)

@@ -181,7 +181,7 @@ EXPECTED = {
     "disk": "cannot be used (the disk is full); all that was stored before is unchanged",
     "reading": "rank 1: tile (0, 0): must be readable",
     "beginning": "rank 0: _alone must succeed",
-    "writing": "rank 1: _writer must succeed",
+    "writing": "rank 1: write_tiles must succeed",
 }
 
 

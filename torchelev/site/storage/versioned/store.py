@@ -7,8 +7,8 @@ import os
 import pickle
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from threading import RLock
@@ -18,7 +18,7 @@ import numpy as np
 from filelock import FileLock
 from numpy.typing import ArrayLike, NDArray
 
-from torchelev.errors import message, require
+from torchelev.errors import require
 from torchelev.site.storage.interface import Arrays, Note, Overtaken, Tile, Version
 from torchelev.site.storage.site_header import Header, new_header, parse_header
 from torchelev.site.storage.tile_files import as_tiles
@@ -27,7 +27,6 @@ from torchelev.site.storage.versioned import arrays as named
 from torchelev.site.storage.versioned import chunks, history
 from torchelev.site.storage.versioned.commits import commit, has_commit
 from torchelev.site.storage.versioned.repository import (
-    StoreError,
     configuration,
     errors_in_words,
     import_icechunk,
@@ -36,9 +35,8 @@ from torchelev.site.storage.versioned.repository import (
     normalize,
     open_storage,
 )
+from torchelev.site.storage.versioned.writing import WAIT, differ_in_time_alone, hold, write_tiles
 
-_WAIT = 120.0  # [s] for other writers of a folder
-_MAX_WRITES = 4  # groups of tiles that are written at a time
 _MARK = "history/mark"  # an array that changes where attributes alone do: a commit has to change something
 _GROUPS = ("keyframes", "merges")  # made at the start: two writers that made one each could not both commit
 
@@ -68,7 +66,7 @@ class VersionedStore:
     def __init__(self, path: str | Path, *, version: str | None = None, read_only: bool = False) -> None:
         self.path, self.is_closed, self._pinned = path, False, version
         self._read_only, self._mutex = read_only or version is not None, RLock()
-        self._lock = None if is_url(path) else FileLock(Path(path) / LOCK, timeout=_WAIT, thread_local=False)
+        self._lock = None if is_url(path) else FileLock(Path(path) / LOCK, timeout=WAIT, thread_local=False)
         self._open, self._num_accepted = None, 0  # session of a transaction; how many processes have joined it
         self._thread = ThreadPoolExecutor(1, "torchelev site")
         with errors_in_words(path):
@@ -195,21 +193,8 @@ class VersionedStore:
     @contextmanager
     def _alone(self) -> Iterator[None]:
         """Be the only writer of a folder until the end of the block; in an object store, do nothing."""
-        with self._mutex:
-            if self._lock is None:
-                yield
-                return
-            try:
-                self._lock.acquire()
-            except TimeoutError as error:
-                rule, hint = f"must become free within {_WAIT:g} s", "wait until it has ended"
-                raise OSError(message(str(self.path), rule, "another writer", hint)) from error
-            except OSError as error:
-                raise StoreError(self.path, error) from error
-            try:
-                yield
-            finally:
-                self._lock.release()
+        with self._mutex, nullcontext() if self._lock is None else hold(self._lock, self.path):
+            yield
 
     def commit(
         self,
@@ -254,38 +239,16 @@ class VersionedStore:
             if str(session.snapshot_id) != self.version:
                 raise Overtaken
             self._open, self._num_accepted = session, 0
-            with self._writer(session, header, written) as write:
+            with write_tiles(session, header, written, self._thread) as write:
                 yield write
             if not (written or arrays or self._num_accepted):
-                if self._differs_in_time_alone(header):  # a merge of nothing new makes no version
+                if differ_in_time_alone(self._header, header):  # a merge of nothing new makes no version
                     self._header = header
                     return
                 arrays = {_MARK: (np.array(header.attributes.get("num_commits", 0)), {})}
             for name, (array, own) in (arrays or {}).items():
                 named.write_array(session.store, name, array, own)
             self._commit(session, header, written, note or Note(f"{len(written)} tile{'s' * (len(written) != 1)}"))
-
-    @contextmanager
-    def _writer(
-        self, session: Any, header: Header, written: set[Tile]
-    ) -> Iterator[Callable[[Sequence[Tile] | NDArray, ArrayLike], None]]:
-        """Yield a function that writes tiles to a session on another thread; all are written at the end."""
-        writes: list[Future[None]] = []
-
-        def write(tiles: Sequence[Tile] | NDArray, values: ArrayLike) -> None:
-            pairs, cells = header.check_tiles(as_tiles(tiles), values)
-            written.update(pairs)
-            writes.append(self._thread.submit(asyncio.run, chunks.put(session.store, pairs, cells)))
-            while len(writes) > _MAX_WRITES:  # as their tiles stay in memory
-                writes.pop(0).result()
-
-        try:
-            yield write
-        finally:
-            failures = [each.exception() for each in writes]
-        for failure in failures:
-            if failure is not None:
-                raise failure
 
     def invite(self) -> bytes:
         """Return what lets other processes join the transaction that is open."""
@@ -297,7 +260,7 @@ class VersionedStore:
     ) -> Iterator[Callable[[Sequence[Tile] | NDArray, ArrayLike], None]]:
         """Yield a function that writes tiles into a transaction of another process, as of `SiteStore`."""
         fork, written = pickle.loads(invitation), set[Tile]()  # of a rank of the same program
-        with errors_in_words(self.path), self._writer(fork, self._header, written) as write:
+        with errors_in_words(self.path), write_tiles(fork, self._header, written, self._thread) as write:
             yield write
         if written:
             results.append(pickle.dumps(fork))
@@ -309,12 +272,6 @@ class VersionedStore:
         if forks:
             with errors_in_words(self.path):
                 self._open.merge(*forks)
-
-    def _differs_in_time_alone(self, header: Header) -> bool:
-        """Return whether a header says nothing new but the time and number of a merge."""
-        before, after = self._header.attributes, header.attributes
-        changed = {name for name in {*before, *after} if before.get(name) != after.get(name)}
-        return changed <= {"time", "num_commits"}
 
     def _commit(self, session: Any, header: Header, written: set[Tile], note: Note) -> None:
         """Commit a session, and show what it left."""
