@@ -12,7 +12,6 @@ from torch import Tensor
 
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
-from torchelev.inputs import checks
 from torchelev.maps.centering import center_on
 from torchelev.ops.masks import count
 from torchelev.ops.storage import keep_freed_memory
@@ -35,9 +34,10 @@ from torchelev.site.fusion.windows import (
     snapshot,
 )
 from torchelev.site.initialize_from_site import add_filled, fill, move_contribution
-from torchelev.site.keyframes.keyframe_log import KeyframeLog, arrays_of, changed_arrays
-from torchelev.site.keyframes.keyframes import Keyframes, Recorded, correct, record
-from torchelev.site.keyframes.rebuild import merge_recorded, rebuild_moved
+from torchelev.site.keyframed_site import KeyframedSite, require_poses
+from torchelev.site.keyframes.keyframe_log import KeyframeLog, arrays_of
+from torchelev.site.keyframes.keyframes import Recorded
+from torchelev.site.keyframes.rebuild import merge_recorded
 from torchelev.site.rasters.raster_site import RasterSite
 from torchelev.site.shared.collective import open_shared
 from torchelev.site.shared.ranks import Ranks
@@ -62,7 +62,7 @@ if TYPE_CHECKING:
 _FREED_BYTES = 96  # of a cell, which a merge takes and frees: faulted in anew, they take a tenth of its time
 
 
-class SiteMap(RasterSite):
+class SiteMap(KeyframedSite, RasterSite):
     """A world map that grows: the windows of many robots, in one frame.
 
     ```python
@@ -203,7 +203,7 @@ class SiteMap(RasterSite):
         """Merge into the version that the site shows; Overtaken if it is no longer the newest one."""
         plans = self._ranks.exchange("merge", lambda: self._plan(emap, time, align, tilt))
         if self._keyframes is not None:
-            T_map_base = _require_poses(emap, T_map_base)
+            T_map_base = require_poses(emap, T_map_base)
         if emap.device.type == "cpu":
             keep_freed_memory(_FREED_BYTES * emap.elevation.numel())
         contribution = self._recall_contribution(emap)
@@ -303,13 +303,6 @@ class SiteMap(RasterSite):
         elevation, variance, time = self._tiles.look_up(locate(x, y), ("elevation", "variance", "time"))
         return elevation, variance + self._clock.rate * (self._time - time)
 
-    def _record(self, windows: Windows, alignment: Alignment, T_map_base: Tensor | None, now: float) -> Recorded | None:
-        """Return the keyframes of a merge; None if none are kept."""
-        if self._keyframes is None or T_map_base is None:
-            return None
-        rows, number, time = self._keyframes.rows, self._keyframes.num_merges, self._epoch + max(self._time, now)
-        return record(windows, alignment, T_map_base, rows, number, time, self.resolution)
-
     def _fuse(
         self,
         windows: Windows,
@@ -337,66 +330,6 @@ class SiteMap(RasterSite):
         contradictions = self._write(parts if self._store else list(parts), time, len(new.ids), arrays_of(new), 1, note)
         self._keyframes.append(new)
         return contradictions
-
-    # Keyframes ------------------------------------------------------------------------------------------------------
-
-    @property
-    def keyframes(self) -> Keyframes:
-        """Ids, robots, times and poses of the keyframes; ValueError if the site keeps none."""
-        return self._require_keyframes().list()
-
-    @torch.inference_mode(False)  # whose tensors could not be written outside of it
-    @torch.no_grad()
-    def move_keyframes(self, ids: Int[Tensor, "K"], T_map_base: Float[Tensor, "K 4 4"]) -> None:
-        """Correct the poses of keyframes, as a pose graph does after it closed a loop.
-
-        The tiles below them are made again of all keyframes that lie there, in the order of their merges, so that the
-        site becomes what mapping with these poses from the start gives: exactly for corrections along z and by whole
-        cells, otherwise to the nearest cell. A pose replaces the offset and tilt of its merge, too. Other tiles keep
-        every bit. On disk, all of it is written or nothing.
-
-        The robots' own maps stay as they are. If they are not corrected, too, what they measure next lies where they
-        believe to be.
-
-        Args:
-            ids: of the keyframes; see `keyframes`.
-            T_map_base: their new poses; `keyframes.T_map_base` has the present ones.
-
-        Raises:
-            TypeError: an argument is not a tensor of the right kind.
-            ValueError: the site keeps no keyframes, is read-only or closed, an id is unknown or repeats, or the poses
-                are not rigid (K, 4, 4). Nothing has changed then.
-            OSError: the disk is full; the site is as it was before.
-        """
-        self._require_keyframes()
-        self._require_writable()
-        with self._turn():
-            while True:
-                try:
-                    self._move_keyframes(ids, T_map_base)
-                except Overtaken:
-                    self.refresh()
-                else:
-                    break
-        self._raise_interrupted()
-
-    def _move_keyframes(self, ids: Tensor, T_map_base: Tensor) -> None:
-        """Move keyframes of the version that the site shows; Overtaken if it is no longer the newest one."""
-        log = self._require_keyframes()
-        after = correct(log.rows, ids, T_map_base)
-        arrays = changed_arrays(log.rows, after)
-        if arrays:
-            parts = rebuild_moved(self._tiles, log, after, self.resolution, self._clock.rate, self.cfg)
-            parts = (part._replace(contradictions=part.contradictions.sum()[None]) for part in parts)
-            note = Note(f"{len(ids)} keyframe{'s' * (len(ids) != 1)} moved")
-            self._write(parts if self._store else list(parts), self._time, 1, arrays, note=note)
-            log.replace(after)
-
-    def _require_keyframes(self) -> KeyframeLog:
-        hint = "make it with SiteMap(..., keyframes=True)"
-        require(self._keyframes is not None, "keyframes", "must be kept by the site", "a site without them", hint)
-        assert self._keyframes is not None
-        return self._keyframes
 
     @torch.inference_mode(False)  # whose tensors could not be written outside of it
     @torch.no_grad()
@@ -430,10 +363,3 @@ def describe_merge(num_robots: int, num_cells: int) -> Note:
     """Return what the history says of a merge."""
     robots = f"{num_robots} robot{'s' * (num_robots != 1)}"
     return Note(f"{robots}, {num_cells:,} new cells", num_robots, num_cells)
-
-
-def _require_poses(emap: ElevationMap, T_map_base: Tensor | None) -> Tensor:
-    """Return the poses of the robots; TypeError or ValueError if there are none or bad ones."""
-    hint = "give the poses of the last update"
-    require(T_map_base is not None, "T_map_base", "must be given, as keyframes are kept", None, hint)
-    return checks.check_pose("T_map_base", T_map_base, (emap.num_envs, 4, 4), emap.device, True)
