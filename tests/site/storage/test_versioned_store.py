@@ -310,6 +310,12 @@ def test_a_commit_in_doubt_is_found_again(store, is_stored):
         ("service error AccessDenied", "the credentials are refused", "AWS_ACCESS_KEY_ID"),
         ("the credential provider was not enabled", "there are no credentials", "AWS_ACCESS_KEY_ID"),
         ("No space left on device (os error 28)", "the disk is full", "make room"),
+        (
+            "invalid snapshot timestamp ordering. parent: `2026",
+            "the clock of this machine, or .* is wrong",
+            "set the clocks",
+        ),
+        ("snapshot timestamp is invalid, please verify", "the clock of this machine, or .* is wrong", "set the clocks"),
         ("dispatch failure", "the server does not answer", "check the network"),
         ("  x something else\n  | context", "something else", "try again"),
     ],

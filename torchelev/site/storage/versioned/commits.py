@@ -9,7 +9,7 @@ from typing import Any
 from torchelev.site.storage.interface import Overtaken
 from torchelev.site.storage.site_header import Header
 from torchelev.site.storage.versioned.history import attributes_of, is_in_history
-from torchelev.site.storage.versioned.repository import UncertainCommitError, import_icechunk
+from torchelev.site.storage.versioned.repository import StoreError, UncertainCommitError, import_icechunk, is_in_doubt
 
 _RECENT = 1000  # commits among which one in doubt is looked for
 
@@ -39,6 +39,7 @@ def commit(
 
     Raises:
         Overtaken: others have changed the same tiles, or the version that the session began with was rolled back.
+        StoreError: it cannot be stored.
         UncertainCommitError: the connection ended; the commit may be stored.
     """
     icechunk, base = import_icechunk(), str(session.snapshot_id)
@@ -49,7 +50,7 @@ def commit(
             if has_commit(repository, key):  # a repeated request met its own result
                 return str(repository.lookup_branch("main")), header
         except icechunk.IcechunkError as error:
-            raise UncertainCommitError(path, error, key) from error
+            raise (UncertainCommitError(path, error, key) if is_in_doubt(error) else StoreError(path, error)) from error
         tip = str(repository.lookup_branch("main"))
         if not is_in_history(repository, base, tip):
             raise Overtaken

@@ -34,6 +34,12 @@ _CAUSES = (  # of a failure: a pattern of its text, the number of the system's e
         "it may not be written",
         "choose a folder that you may write to",
     ),
+    (
+        "timestamp is invalid|timestamp ordering",
+        errno.EINVAL,
+        "the clock of this machine, or of one that wrote before, is wrong",
+        "set the clocks of all writers, by NTP say, and merge again",
+    ),
     ("spec version|newer version", errno.EINVAL, "its Icechunk is newer", "open it on Python 3.12 or later"),
     (
         r"dispatch failure|connect|timed? ?out",
@@ -143,6 +149,11 @@ def errors_in_words(path: str | Path) -> Iterator[None]:
         raise
     except icechunk.IcechunkError as error:
         raise StoreError(path, error) from error
+
+
+def is_in_doubt(error: Exception) -> bool:
+    """Return whether a commit that ended with this error may be stored, as the answer may be lost."""
+    return in_words(error)[0] in (errno.ECONNREFUSED, errno.EIO)
 
 
 def in_words(error: Exception) -> tuple[int, str, str]:
