@@ -17,6 +17,7 @@ from tests.site.helpers import fill, live
 from torchelev.site import LostRankError, SiteConfig, SiteMap
 from torchelev.site.reading import LAYERS
 from torchelev.site.storage.versioned import store
+from torchelev.site.storage.versioned.repository import RefusedCommitError
 
 NUM_ROBOTS = 11
 CORNERS = [(0, 0), (12, -9), (20, 25), (-30, 6), (8, 20), (45, 30), (160, 0), (170, 8), (-8, -20), (25, 5), (-99, 70)]
@@ -235,7 +236,7 @@ def _with_full_disk(merge):
     def fail(*args):
         import icechunk
 
-        raise icechunk.IcechunkError("object store error: No space left on device")
+        raise RefusedCommitError("site", icechunk.IcechunkError("object store error: No space left on device"))
 
     commit, store.commit = store.commit, fail
     try:

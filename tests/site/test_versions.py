@@ -9,8 +9,10 @@ import torch
 pytest.importorskip("icechunk", reason="needs Python 3.11")
 
 
+import icechunk
+
 from tests.site.helpers import fill, known_cells, robots
-from torchelev.site import SiteConfig, SiteMap
+from torchelev.site import SiteConfig, SiteMap, UncertainCommitError
 
 CORNERS = [(0, 0), (70, 0)]
 
@@ -114,6 +116,119 @@ def test_keyframes_go_back_too(path):
     emap.reset()
     site.merge(move(emap, 1), T_map_base=T)
     assert len(site.keyframes.ids) == 4
+
+
+def test_a_site_goes_back_to_what_it_was_when_new(path):
+    site, emap = SiteMap(0.1, path), robots(CORNERS)
+    site.merge(emap, time=100.0)
+    site.rollback(site.versions()[-1].id)
+    assert len(site) == 0 and site.time == 0.0
+    emap.reset()
+    again = SiteMap.open(path)
+    again.merge(move(emap, 0), time=200.0)
+    assert again.time == 200.0 and len(known_cells(again)) == 2 * 40 * 36
+
+
+@pytest.mark.parametrize("what", ["a merge of nothing", "initialize_from"])
+def test_maps_that_a_rollback_took_back_are_refused_whatever_they_did_since(path, what):
+    site, emap = SiteMap(0.1, path), robots(CORNERS)
+    site.merge(robots([(300, 0)]), time=1.0)
+    version = site.version
+    site.merge(emap, time=2.0)
+    if what == "a merge of nothing":
+        site.merge(emap, time=3.0)
+    site.rollback(version)
+    if what == "initialize_from":
+        emap.initialize_from(site)
+    with pytest.raises(ValueError, match="emap: must be reset after a rollback"):
+        site.merge(emap, time=4.0)
+
+
+def test_an_error_after_the_commit_does_not_count_twice(path, monkeypatch):
+    site, emap = SiteMap(0.1, path), robots(CORNERS)
+    site.merge(robots([(300, 0)]), time=1.0)
+    repository = site._store._repository
+
+    class Failing:
+        def __getattr__(self, name):
+            return getattr(repository, name)
+
+        def readonly_session(self, **options):
+            raise icechunk.IcechunkError("object store error: dispatch failure")
+
+    site._store._repository = Failing()
+    with pytest.raises(UncertainCommitError, match="whether the commit is stored shows at the next merge"):
+        site.merge(emap, time=2.0)
+    site._store._repository = repository
+    assert not site.merge(emap, time=3.0).new_cells.any()
+    assert min(known_cells(site, "variance").values()) > 0.9e-4 and len(site.versions()) == 3
+
+
+def test_a_writer_without_keyframes_does_not_drop_those_of_another(path):
+    site = SiteMap(0.1, path, keyframes=True)
+    SiteMap.open(path).merge(robots(CORNERS))
+    with pytest.raises(ValueError, match="keyframes: must be kept from the first merge on, got a site without; begin"):
+        site.merge(robots(CORNERS), T_map_base=torch.eye(4, dtype=torch.float64).repeat(2, 1, 1))
+
+
+def test_a_site_that_cannot_be_used_does_not_stay_locked(path):
+    SiteMap(0.1, path, engine="files").close()
+    with pytest.raises((RuntimeError, AssertionError)) as kept:
+        SiteMap(0.1, path, device="cuda:77")
+    SiteMap(0.1, path).close()
+    assert kept
+
+
+def test_the_engine_of_a_site_stays(path):
+    SiteMap(0.1, path).close()
+    with pytest.raises(ValueError, match="engine: must be icechunk, that of .*, got files; leave it out"):
+        SiteMap(0.1, path, engine="files")
+
+
+MAKER = """
+import sys
+from torchelev.site import SiteMap
+print("ready", flush=True)
+sys.stdin.readline()
+print(SiteMap(0.1, sys.argv[1]).version)
+"""
+
+
+def test_processes_that_make_a_site_at_once_share_it(path):
+    command = [sys.executable, "-c", MAKER, str(path)]
+    makers = [subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) for _ in range(3)]
+    for maker in makers:
+        assert maker.stdout.readline() == "ready\n"
+    for maker in makers:
+        maker.stdin.write("go\n")
+        maker.stdin.flush()
+    assert {maker.communicate()[0] for maker in makers} == {f"{SiteMap.open(path).version}\n"}
+
+
+def test_half_a_site_says_so(path):
+    icechunk.Repository.create(icechunk.local_filesystem_storage(str(path)))
+    with pytest.raises(ValueError, match="must be a whole site, got one whose making was interrupted; remove it"):
+        SiteMap(0.1, path)
+
+
+def test_closed_and_read_only_sites_get_no_tags(path):
+    SiteMap(0.1, path).close()
+    for site in (SiteMap.open(path, read_only=True), SiteMap.open(path, SiteMap.open(path).version)):
+        with pytest.raises(ValueError, match="site: must be open for writing"):
+            site.tag("a")
+
+
+def test_a_robot_that_waits_changes_nothing(path):
+    site, emap = SiteMap(0.1, path), robots(CORNERS, known=0.5)
+    emap.state.bounded.copy_(~emap.state.validity)
+    emap.state.upper_bound.fill_(2.0)
+    site.merge(emap, time=1.0)
+    version = site.version
+    site.merge(emap, time=2.0)
+    assert site.version == version and known_cells(site, "upper_bound")
+    emap.state.upper_bound.fill_(1.0)
+    site.merge(emap, time=3.0)
+    assert site.version != version and max(known_cells(site, "upper_bound").values()) == 1.0
 
 
 def test_history_does_not_grow_without_end(path):

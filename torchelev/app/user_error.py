@@ -61,6 +61,8 @@ def user_errors() -> Iterator[None]:
     except ModuleNotFoundError as error:
         extra = _EXTRAS.get(str(error.name).split(".")[0], "io")
         raise UserError(f"{error}; install it with pip install 'torchelev[{extra}]'") from error
+    except BrokenPipeError:  # of `| head`: click ends quietly
+        raise
     except KeyError as error:  # whose text is its argument's repr
         raise UserError(error.args[0] if error.args else error) from error
     except (RecordingError, ValueError, OSError) as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchelev.channels.config import ChannelConfig
-from torchelev.errors import require
+from torchelev.errors import message, require
 from torchelev.files.output_files import MARK, atomic_file
 from torchelev.io.export import take
 
@@ -81,7 +82,18 @@ def color_roles(channels: Mapping[str, ChannelConfig]) -> dict[str, str]:
 def check_epsg(epsg: object) -> None:
     """Raise ValueError unless it may be the code of a projected coordinate system, or None."""
     is_code = epsg is None or (isinstance(epsg, int) and 1024 <= epsg <= 32767)
-    require(is_code, "epsg", "must be the code of a projected system, 1024 to 32767", repr(epsg), "give 32632, say")
+    rule, hint = "must be the code of a projected system in metres, 1024 to 32767", "give 32632, say"
+    require(is_code, "epsg", rule, repr(epsg), hint)
+    if epsg is not None and find_spec("rasterio") is not None:
+        from rasterio.crs import CRS
+        from rasterio.errors import CRSError
+
+        try:
+            system = CRS.from_epsg(epsg)
+        except CRSError as error:
+            raise ValueError(message("epsg", rule, f"{epsg}, which is unknown", hint)) from error
+        is_metric = system.is_projected and system.linear_units_factor[1] == 1.0
+        require(is_metric, "epsg", rule, f"{epsg}, which is not", hint)
 
 
 class Bands(NamedTuple):

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import uuid
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -77,8 +78,19 @@ class OpenedSite(ReadableSite):
         site.resolution = float(site._store.attributes["resolution"])
         site.cfg = checks.given_or_default(SiteConfig, cfg)
         site._keyframes = None
-        site._begin(device)
+        with site._closed_on_failure():
+            site._begin(device)
         return site
+
+    @contextmanager
+    def _closed_on_failure(self) -> Iterator[None]:
+        """Let other writers in if the block fails."""
+        try:
+            yield
+        except BaseException:
+            if self._store is not None:
+                self._store.close()
+            raise
 
     def _begin(
         self, device: torch.device | str, channels: SiteChannels | None = None, levels: SiteLevels | None = None
@@ -145,12 +157,15 @@ class OpenedSite(ReadableSite):
         stored = {} if self._store is None else self._store.attributes
         self._id, self._rollbacks = stored.get("id", self._id), stored.get("rollbacks", [])
         self._robots = stored.get("robots", {})
-        if "num_commits" in stored:  # it has been merged into
-            self._epoch, self._time = stored["epoch"], stored["time"]
-            self._opened, self._num_commits = self._time, stored["num_commits"]
-            self._rasters = list(stored.get("rasters", []))
-            self._rate = stored["variance_rate"] if self.cfg.variance_rate is None else self.cfg.variance_rate
-            merges = stored.get("keyframe_merges")
+        self._rasters, self._num_commits = list(stored.get("rasters", [])), stored.get("num_commits", 0)
+        if self._num_commits:  # of a new site, and one that went back to it, there is no more
+            self._epoch, self._time = stored.get("epoch", 0.0), stored.get("time", 0.0)
+            self._opened = self._time
+            rate = self.cfg.variance_rate
+            self._rate = stored.get("variance_rate") if rate is None else rate
+            merges = stored.get("keyframe_merges", 0 if "epoch" not in stored and self._keyframes else None)
+            rule, hint = "must be kept from the first merge on", "begin another site: a writer without merged first"
+            require(merges is not None or self._keyframes is None, "keyframes", rule, "a site without", hint)
             self._keyframes = None if merges is None else KeyframeLog(self._store, merges)
 
     def _are_of_others(self, tiles: list[Tile]) -> list[bool]:
@@ -192,7 +207,7 @@ class OpenedSite(ReadableSite):
                 raise
             self._interrupted = error  # after the commit: raised once memory has followed
         stored = attributes if self._store is None or self._ranks.size > 1 else self._store.attributes
-        if stored["num_commits"] != attributes["num_commits"]:  # on top of another writer's tiles
+        if stored["num_commits"] > attributes["num_commits"]:  # on top of another writer's tiles
             self._tiles.forget()
         self._time, self._num_commits = stored["time"], stored["num_commits"]
         if self._ranks.size > 1:  # other ranks have written theirs

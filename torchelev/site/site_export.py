@@ -79,6 +79,9 @@ def choose_area(
         cells = [value / resolution for value in extent]
         sides = [[math.floor(cells[k] + _ROUNDING), math.ceil(cells[k + 1] - _ROUNDING)] for k in (0, 2)]
     (x, x_end), (y, y_end) = sides
+    rows, columns = range(x // TILE, (x_end - 1) // TILE + 1), range(y // TILE, (y_end - 1) // TILE + 1)
+    is_there = any(a in rows and b in columns for a, b in tiles)
+    require(is_there, "area", "must hold known cells", f"nothing known in {extent}", "see site.extent")
     return Area((x, y), (x_end - x, y_end - y), layers, resolution, copy, color_roles(tiles.channels.configs))
 
 

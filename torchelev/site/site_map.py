@@ -44,7 +44,7 @@ from torchelev.site.shared.ranks import Ranks
 from torchelev.site.shared.shared_merge import gather_tiles, merge_shared
 from torchelev.site.site_config import SiteConfig
 from torchelev.site.site_levels import SiteLevels
-from torchelev.site.storage.interface import Note, Overtaken
+from torchelev.site.storage.interface import InDoubtError, Note, Overtaken
 from torchelev.site.storage.versioned.repository import UncertainCommitError
 from torchelev.site.tiles import LAYERS, locate
 from torchelev.site.times import check_time, continue_time, warn_of_other_clock
@@ -135,7 +135,8 @@ class SiteMap(KeyframedSite, RasterSite):
             None if path is None else open_shared(self._ranks, "SiteMap", path, self.resolution, *wanted, engine)
         )
         self._keyframes = KeyframeLog(self._store) if keyframes else None
-        self._begin(device, *wanted)
+        with self._closed_on_failure():
+            self._begin(device, *wanted)
         self._check_kept(keyframes, *wanted)
         self._agree_on_id()
 
@@ -191,6 +192,9 @@ class SiteMap(KeyframedSite, RasterSite):
                     if self._ranks.size > 1:
                         raise OSError("site: must have no other writer beside a group, got one: end it") from None
                     self.refresh()
+                except InDoubtError:
+                    self._is_broken = self._ranks.size > 1  # whose ranks would have to settle it together
+                    raise
                 else:
                     break
             self._compact_in_time()
@@ -275,6 +279,8 @@ class SiteMap(KeyframedSite, RasterSite):
         self.require_resolution(emap)
         self._tiles.channels.require_fit(emap)
         self._require_writable()
+        rule, hint = "must be opened again by all ranks, with maps that are reset", "the last commit may be stored"
+        require(not self._is_broken, "site", rule, "a group after a lost connection", hint)
         self._require_not_taken_back(emap, contributions.get(emap, {}).get(self._id))
 
     def require_resolution(self, emap: ElevationMap) -> None:
@@ -336,7 +342,9 @@ class SiteMap(KeyframedSite, RasterSite):
     def fill_state(self, emap: ElevationMap, T_map_base: Tensor | None, chosen: Bool[Tensor, "B"]) -> MapState:
         """Return a map's state with what the site knows filled in; `ElevationMap.initialize_from` calls it."""
         self.require_resolution(emap)
+        self._settle()
         contribution, state, device = self._recall_contribution(emap), self._bring(emap), self._tiles.device
+        number = None if contribution is None else contribution.number
         chosen = chosen.to(device)
         if T_map_base is not None:
             state = center_on(state, emap, T_map_base.to(device), chosen)
@@ -348,7 +356,7 @@ class SiteMap(KeyframedSite, RasterSite):
         filled = add_filled(contribution, state, after, self._clock.rate, chosen)
         if self._tiles.levels:
             filled = fill_levels(emap, state, after, self._tiles, filled, chosen, self._clock, self.resolution)
-        self._keep(emap, filled)
+        self._keep(emap, filled, number)
         return map_layers(lambda value: value.to(emap.device), after)
 
     def _read_chosen(self, state: MapState, chosen: Bool[Tensor, "B"]) -> Remembered:

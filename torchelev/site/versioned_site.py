@@ -23,6 +23,7 @@ contributions: WeakKeyDictionary[ElevationMap, dict[str, Contribution]] = WeakKe
 class VersionedSite(OpenedSite):
     """A site that knows its versions: each merge makes one."""
 
+    _is_broken = False  # a group whose last commit is in doubt
     _in_doubt: tuple[str, ElevationMap, Contribution] | None = None  # a commit, and what it would have contributed
 
     @property
@@ -58,10 +59,11 @@ class VersionedSite(OpenedSite):
 
         Raises:
             KeyError: there is no such version.
-            ValueError: the name is or was taken or is none, or the site is in memory or of files.
+            ValueError: the name is or was taken or is none, or the site is read-only, closed, in memory or of files.
             OSError: the store cannot be written.
         """
         store = self._require_store("tag")
+        self._require_writable()
         store.tag(name, store.version if version is None else version)
 
     def rollback(self, version: str) -> str:
@@ -133,12 +135,14 @@ class VersionedSite(OpenedSite):
         if self._in_doubt is not None and self._store is not None:
             commit, emap, contribution = self._in_doubt
             if self._store.holds(commit):
+                self.refresh()
                 self._keep(emap, contribution)
             self._in_doubt = None
 
-    def _keep(self, emap: ElevationMap, contribution: Contribution) -> None:
-        """Remember what a map has contributed."""
-        contributions.setdefault(emap, {})[self._id] = contribution._replace(number=self._num_commits)
+    def _keep(self, emap: ElevationMap, contribution: Contribution, number: int | None = None) -> None:
+        """Remember what a map has contributed; `number`: of the commit, None: the last one."""
+        number = self._num_commits if number is None else number
+        contributions.setdefault(emap, {})[self._id] = contribution._replace(number=number)
 
     def _require_not_taken_back(self, emap: ElevationMap, contribution: Contribution | None) -> None:
         """Raise ValueError if a rollback has taken back the last merge of a map that has not been reset since."""

@@ -143,7 +143,7 @@ def test_a_merger_that_is_killed_counts_nothing_twice_and_loses_nothing(tmp_path
                 walk(walkers, links, direct, steps=1)
                 time.sleep(0.3)
             assert merger.wait() == KILLED
-        with MergerProcess(tmp_path / "site", port):
+        with MergerProcess(tmp_path / "site", port, engine=engine):
             assert all(link.flush(20.0) for link in links)
     with SiteMap.open(tmp_path / "site", read_only=True) as site:
         assert_same(site, direct)

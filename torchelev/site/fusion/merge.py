@@ -74,6 +74,7 @@ def merge_windows(
     for change in changes.values():
         touched = touched | change.is_new
     groups = group_tiles(windows.known.corner, touched)
+    can_rest = surfaces is None and not changes  # tiles whose bounds alone are seen again
     offers, has_bounds = read_offers(windows, alignment, resolution), bool(windows.is_bounded.any())
     tiles.reserve(sum(tile not in tiles for group in groups for tile in group.tiles))
 
@@ -87,11 +88,17 @@ def merge_windows(
             robot = place[fuse_entries(layers, entries, rate, cfg)] // size
         else:
             robot = fuse_levels(layers, entries, place // size, place, tiles, robots, pieces, rate, cfg)
+        bound = layers[_BOUND].clone() if has_bounds and not len(cell) else None
         if has_bounds:
             lower_bounds(layers, *_read_bounds(windows, alignment, pieces, resolution))
         fuse_channels(layers, before, layers[_ELEVATION], tiles, pieces, changes)
         contradictions = torch.bincount(robot, minlength=len(alignment.offset))
-        return Merged(pieces.tiles, values, contradictions)
+        is_same = (
+            bound is not None
+            and can_rest
+            and bool(((bound == layers[_BOUND]) | bound.isnan() & layers[_BOUND].isnan()).all())
+        )
+        return Merged([], values[:, :0], contradictions) if is_same else Merged(pieces.tiles, values, contradictions)
 
     work = ((group, tiles.read(group.tiles)) for group in groups)
     return map_in_order(fuse_group, work) if tiles.device.type == "cpu" else map(fuse_group, work)

@@ -279,7 +279,9 @@ def _open(
         site = ServedSite(0.1 if resolution is None else resolution, path, cfg=cfg, device=device, engine=engine)
     try:
         site.require_heights_alone()
-    except ValueError:
+        with site.turn():  # now, and not at the first message: can it be written?
+            pass
+    except (ValueError, OSError):
         site.close()
         raise
     return site

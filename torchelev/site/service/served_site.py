@@ -69,7 +69,7 @@ class ServedSite(SiteMap):
         windows, latest = received.windows, float(received.windows.known.now.max())
         if self._rate is None:
             self._rate = float(windows.known.rate[0])
-        if not len(self._tiles) and not self._robots:
+        if not self._has_clock:
             self._epoch, self._time = latest, 0.0
         windows = _since(self._epoch, windows)
         alignment = _keep_last(self._align(windows, align, tilt), received, align)

@@ -82,11 +82,22 @@ def _open(
     if not is_there and not read_only:
         attributes = {"id": uuid.uuid4().hex, "resolution": resolution, "channels": channels.attributes}
         layers = (*LAYERS, *channels.stored, *levels.stored)
-        return create_store(
-            path, layers=layers, tile_size=TILE, attributes=attributes | levels.attributes, engine=engine
-        )
+        attributes |= levels.attributes
+        store = create_store(path, layers=layers, tile_size=TILE, attributes=attributes, engine=engine)
+        return _check_resolution(store, path, resolution)  # another process may just have made it
     require(is_there, "path", "must be a folder that all ranks see", path, "mount it on every machine", OSError)
     store = open_store(path, read_only=read_only)
+    hint = f"leave it out, or torchelev site convert {path} NEW --engine {engine}"
+    try:
+        require(engine in (None, store.engine), "engine", f"must be {store.engine}, that of {path}", engine, hint)
+    except ValueError:
+        store.close()
+        raise
+    return _check_resolution(store, path, resolution)
+
+
+def _check_resolution(store: SiteStore, path: str | Path, resolution: float) -> SiteStore:
+    """Return a store; ValueError if it is of another resolution."""
     actual, hint = float(store.attributes["resolution"]), "give that resolution, or another path"
     is_same = math.isclose(actual, resolution, rel_tol=1e-9)
     if not is_same:

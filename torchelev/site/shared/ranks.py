@@ -11,12 +11,13 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import message, require
+from torchelev.site.storage.interface import InDoubtError, Overtaken
 
 if TYPE_CHECKING:
     from torch.distributed import ProcessGroup
 
 _MESSAGE_BYTES, _BYTES_OF_RANK, _MAX_TEXT = 2048, 16, 300
-_ERRORS = {error.__name__: error for error in (ValueError, TypeError, KeyError, OSError)}
+_ERRORS = {error.__name__: error for error in (InDoubtError, Overtaken, ValueError, TypeError, KeyError, OSError)}
 
 
 class LostRankError(RuntimeError):

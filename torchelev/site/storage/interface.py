@@ -17,6 +17,10 @@ Tile = tuple[int, int]
 Arrays = Mapping[str, tuple[NDArray, Mapping[str, Any]]]  # name -> values and attributes
 
 
+class InDoubtError(OSError):
+    """The connection ended while a commit was on its way: it may be stored."""
+
+
 class Overtaken(Exception):  # noqa: N818  # nobody sees it: the site merges again
     """Another writer has changed tiles of a transaction since it began. Nothing of it is stored."""
 
@@ -55,6 +59,10 @@ class SiteStore(Protocol):
     @property
     def path(self) -> Path | str:
         """The folder, or the URL in an object store."""
+
+    @property
+    def engine(self) -> str:
+        """Name of the engine, as of `SiteMap`."""
 
     @property
     def is_closed(self) -> bool:

@@ -38,6 +38,8 @@ class TileStore:
     Create one with `create` or `open`, and `close` it or use it in a `with` block.
     """
 
+    engine = "files"
+
     def __init__(self, path: Path, lock: FileLock | None) -> None:
         self.path = path
         self._lock, self._committing, self.is_closed = lock, Lock(), False

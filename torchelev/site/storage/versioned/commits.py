@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,12 @@ from typing import Any
 from torchelev.site.storage.interface import Overtaken
 from torchelev.site.storage.site_header import Header
 from torchelev.site.storage.versioned.history import attributes_of, is_in_history
-from torchelev.site.storage.versioned.repository import StoreError, UncertainCommitError, import_icechunk, is_in_doubt
+from torchelev.site.storage.versioned.repository import (
+    RefusedCommitError,
+    UncertainCommitError,
+    import_icechunk,
+    is_in_doubt,
+)
 
 _RECENT = 1000  # commits among which one in doubt is looked for
 
@@ -39,7 +45,7 @@ def commit(
 
     Raises:
         Overtaken: others have changed the same tiles, or the version that the session began with was rolled back.
-        StoreError: it cannot be stored.
+        RefusedCommitError: it cannot be stored.
         UncertainCommitError: the connection ended; the commit may be stored.
     """
     icechunk, base = import_icechunk(), str(session.snapshot_id)
@@ -47,10 +53,12 @@ def commit(
         try:
             return str(session.commit(text, metadata=make_metadata(header.attributes))), header
         except icechunk.ConflictError:
-            if has_commit(repository, key):  # a repeated request met its own result
-                return str(repository.lookup_branch("main")), header
+            stored = find_commit(repository, key)
+            if stored:  # a repeated request met its own result, on top of which there may be others' by now
+                return stored, header
         except icechunk.IcechunkError as error:
-            raise (UncertainCommitError(path, error, key) if is_in_doubt(error) else StoreError(path, error)) from error
+            found = UncertainCommitError(path, error, key) if is_in_doubt(error) else RefusedCommitError(path, error)
+            raise found from error
         tip = str(repository.lookup_branch("main"))
         if not is_in_history(repository, base, tip):
             raise Overtaken
@@ -62,14 +70,10 @@ def commit(
         header = header.with_attributes(_on_top(attributes_of(repository, base), header.attributes))
 
 
-def has_commit(repository: Any, key: str) -> bool:
-    """Return whether a commit with this key is among the newest ones."""
-    for number, snapshot in enumerate(repository.ancestry(branch="main")):
-        if snapshot.metadata.get("commit") == key:
-            return True
-        if number == _RECENT:
-            return False
-    return False
+def find_commit(repository: Any, key: str) -> str:
+    """Return the id of the commit with this key among the newest ones; "" if there is none."""
+    recent = itertools.islice(repository.ancestry(branch="main"), _RECENT)
+    return next((str(snapshot.id) for snapshot in recent if snapshot.metadata.get("commit") == key), "")
 
 
 def _on_top(theirs: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:

@@ -49,6 +49,11 @@ def attributes_of(repository: Any, snapshot: str) -> dict[str, Any]:
     return dict(json.loads(repository.lookup_snapshot(snapshot).metadata.get("attributes", "{}")))
 
 
+def is_whole(repository: Any, snapshot: str) -> bool:
+    """Return whether something was committed to a repository after it was made."""
+    return repository.lookup_snapshot(snapshot).parent_id is not None
+
+
 def metadata_of(attributes: Mapping[str, Any], note: Note, key: str = "") -> dict[str, Any]:
     """Return the metadata of a snapshot.
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from torchelev.errors import require
+from torchelev.site.storage.interface import InDoubtError
 
 _URL = re.compile(r"s3:/{1,2}([^/]+)(?:/(.*))?")  # a Path has dropped one slash
 _MARKS = ("refs", "repo")  # what a folder holds once it is a repository, of Icechunk 1 and 2
@@ -53,15 +54,17 @@ _CAUSES = (  # of a failure: a pattern of its text, the number of the system's e
 class StoreError(OSError):
     """A repository cannot be read or written. All that was committed before is unchanged."""
 
-    def __init__(
-        self, path: str | Path, error: Exception, more: str = "all that was stored before is unchanged"
-    ) -> None:
+    def __init__(self, path: str | Path, error: Exception, rest: str = _UNCHANGED) -> None:
         number, meaning, hint = in_words(error)
-        super().__init__(f"{path}: cannot be used ({meaning}); {more}: {hint}")
+        super().__init__(f"{path}: cannot be used ({meaning}); {rest}: {hint}")
         self.errno = number
 
 
-class UncertainCommitError(StoreError):
+class RefusedCommitError(StoreError):
+    """A commit was refused: nothing of it is stored."""
+
+
+class UncertainCommitError(StoreError, InDoubtError):
     """The connection ended while a commit was on its way: it may be stored. The next merge finds out."""
 
     def __init__(self, path: str | Path, error: Exception, commit: str) -> None:
@@ -131,12 +134,23 @@ def open_storage(path: str | Path) -> Any:
 
 
 def configuration() -> Any:
-    """Return the settings of a repository: one request for a chunk, as splitting those of small ones takes longer."""
+    """Return the settings of a repository.
+
+    One request for a chunk, as splitting those of small ones takes longer. Small caches: by default, those of the
+    references of chunks grow by a megabyte with each merge into a site of 10,000 tiles.
+    """
     icechunk = import_icechunk()
     one = icechunk.StorageConcurrencySettings(
         max_concurrent_requests_for_object=1, ideal_concurrent_request_size=1 << 24
     )
-    return icechunk.RepositoryConfig(storage=icechunk.StorageSettings(concurrency=one))
+    caching = icechunk.CachingConfig(
+        num_snapshot_nodes=1_000,
+        num_chunk_refs=100_000,
+        num_transaction_changes=0,
+        num_bytes_attributes=0,
+        num_bytes_chunks=0,
+    )
+    return icechunk.RepositoryConfig(storage=icechunk.StorageSettings(concurrency=one), caching=caching)
 
 
 @contextmanager

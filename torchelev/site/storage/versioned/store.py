@@ -25,8 +25,11 @@ from torchelev.site.storage.tile_files import as_tiles
 from torchelev.site.storage.transaction import LOCK
 from torchelev.site.storage.versioned import arrays as named
 from torchelev.site.storage.versioned import chunks, history
-from torchelev.site.storage.versioned.commits import commit, has_commit
+from torchelev.site.storage.versioned.commits import commit, find_commit
 from torchelev.site.storage.versioned.repository import (
+    RefusedCommitError,
+    StoreError,
+    UncertainCommitError,
     configuration,
     errors_in_words,
     import_icechunk,
@@ -35,10 +38,16 @@ from torchelev.site.storage.versioned.repository import (
     normalize,
     open_storage,
 )
-from torchelev.site.storage.versioned.writing import WAIT, differ_in_time_alone, hold, write_tiles
+from torchelev.site.storage.versioned.writing import (
+    WAIT,
+    differ_in_time_alone,
+    hold,
+    make_repository,
+    making_lock,
+    write_tiles,
+)
 
 _MARK = "history/mark"  # an array that changes where attributes alone do: a commit has to change something
-_GROUPS = ("keyframes", "merges")  # made at the start: two writers that made one each could not both commit
 
 
 class VersionedStore:
@@ -63,6 +72,8 @@ class VersionedStore:
     _tiles: frozenset[Tile]
     _open: Any
 
+    engine = "icechunk"
+
     def __init__(self, path: str | Path, *, version: str | None = None, read_only: bool = False) -> None:
         self.path, self.is_closed, self._pinned = path, False, version
         self._read_only, self._mutex = read_only or version is not None, RLock()
@@ -77,20 +88,13 @@ class VersionedStore:
     def create(
         cls, path: str | Path, *, layers: Sequence[str], tile_size: int, attributes: Mapping[str, Any]
     ) -> VersionedStore:
-        """Make a new site; arguments and errors as of `TileStore.create`."""
-        import zarr
-
-        header, path, icechunk = new_header(layers, tile_size, attributes), normalize(path), import_icechunk()
-        metadata = history.metadata_of(header.attributes, Note("new site"))
+        """Make a new site, or open the one that another process has just made; arguments as of `TileStore.create`."""
+        header, path = new_header(layers, tile_size, attributes), normalize(path)
         if isinstance(path, Path):
             path.mkdir(parents=True, exist_ok=True)
-        with errors_in_words(path):
-            repository = icechunk.Repository.create(open_storage(path), configuration())
-            session = repository.writable_session("main")
-            chunks.create_cells(session.store, header)
-            for name in _GROUPS:
-                zarr.create_group(session.store, path=name)
-            session.commit("new site", metadata=metadata)
+        with hold(making_lock(path), path):
+            if not is_repository(path):
+                make_repository(path, header)
         return cls(path)
 
     @classmethod
@@ -243,7 +247,8 @@ class VersionedStore:
                 yield write
             if not (written or arrays or self._num_accepted):
                 if differ_in_time_alone(self._header, header):  # a merge of nothing new makes no version
-                    self._header = header
+                    time = {"time": header.attributes["time"]} if "time" in header.attributes else {}
+                    self._header = self._header.with_attributes(self._header.attributes | time)
                     return
                 arrays = {_MARK: (np.array(header.attributes.get("num_commits", 0)), {})}
             for name, (array, own) in (arrays or {}).items():
@@ -284,17 +289,21 @@ class VersionedStore:
                 return
             self._session = self._repository.readonly_session(snapshot_id=snapshot)
             self._header, self._tiles = header, self._tiles | written
+        except (RefusedCommitError, UncertainCommitError):
+            raise
+        except (import_icechunk().IcechunkError, StoreError) as error:
+            raise UncertainCommitError(self.path, error, key) from error  # it was sent, and may be stored
         except Exception:
             raise
         except BaseException:  # Ctrl-C, right after it was committed
-            if has_commit(self._repository, key):
+            if find_commit(self._repository, key):
                 self._show(self._newest())
             raise
 
     def holds(self, commit: str) -> bool:
         """Return whether a commit that ended in an `UncertainCommitError` is stored."""
         with errors_in_words(self.path):
-            return has_commit(self._repository, commit)
+            return bool(find_commit(self._repository, commit))
 
     def close(self) -> None:
         """Write no more. Reading stays possible."""
@@ -344,6 +353,9 @@ class VersionedStore:
         """Show a version."""
         with errors_in_words(self.path):
             session = self._repository.readonly_session(snapshot_id=snapshot)
+            hint = "remove it, and make it again"
+            is_whole = history.is_whole(self._repository, snapshot)
+            require(is_whole, str(self.path), "must be a whole site", "one whose making was interrupted", hint)
             attributes = history.attributes_of(self._repository, snapshot)
             header = parse_header(self.path, chunks.read_attributes(session.store) | attributes)
             self._session, self._header, self._tiles = session, header, self._run(chunks.list_tiles(session))

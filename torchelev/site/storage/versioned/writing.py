@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import getpass
+import hashlib
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future
 from contextlib import contextmanager
@@ -13,12 +16,20 @@ from filelock import FileLock
 from numpy.typing import ArrayLike, NDArray
 
 from torchelev.errors import message
-from torchelev.site.storage.interface import Tile
+from torchelev.site.storage.interface import Note, Tile
 from torchelev.site.storage.site_header import Header
 from torchelev.site.storage.tile_files import as_tiles
 from torchelev.site.storage.versioned import chunks
-from torchelev.site.storage.versioned.repository import StoreError
+from torchelev.site.storage.versioned.history import metadata_of
+from torchelev.site.storage.versioned.repository import (
+    StoreError,
+    configuration,
+    errors_in_words,
+    import_icechunk,
+    open_storage,
+)
 
+_GROUPS = ("keyframes", "merges")  # made at the start: two writers that made one each could not both commit
 WAIT = 120.0  # [s] for other writers of a folder
 _MAX_WRITES = 4  # groups of tiles that are written at a time
 
@@ -37,6 +48,26 @@ def hold(lock: FileLock, path: str | Path) -> Iterator[None]:
         yield
     finally:
         lock.release()
+
+
+def making_lock(path: str | Path) -> FileLock:
+    """Return the lock under which a user makes a site: outside of its folder, which must be empty until then."""
+    name = hashlib.sha256(str(path).encode()).hexdigest()[:16]
+    return FileLock(Path(tempfile.gettempdir(), f"torchelev-{getpass.getuser()}-{name}.lock"), timeout=WAIT)
+
+
+def make_repository(path: str | Path, header: Header) -> None:
+    """Make the repository of a new site; StoreError if there is one, or it cannot be written."""
+    import zarr
+
+    icechunk, metadata = import_icechunk(), metadata_of(header.attributes, Note("new site"))
+    with errors_in_words(path):
+        repository = icechunk.Repository.create(open_storage(path), configuration())
+        session = repository.writable_session("main")
+        chunks.create_cells(session.store, header)
+        for name in _GROUPS:
+            zarr.create_group(session.store, path=name)
+        session.commit("new site", metadata=metadata)
 
 
 @contextmanager
