@@ -42,7 +42,7 @@ def require_positive(**values: object) -> None:
         # Testing for float first takes a tenth of the time; the text is composed only if needed.
         is_number = isinstance(value, (float, Real)) and not isinstance(value, bool) and math.isfinite(value)
         if not (is_number and value > 0):  # type: ignore[operator]
-            raise ValueError(message(name, "must be a positive number", repr(value), "give one above 0"))
+            raise ValueError(message(name, "must be a positive number", repr(value), "give metres"))
 
 
 def whole_cells(name: str, length: float, resolution: float) -> int:
