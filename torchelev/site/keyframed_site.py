@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 import torch
@@ -13,7 +14,7 @@ from torchelev.site.fusion.windows import Alignment, Windows
 from torchelev.site.keyframes.keyframe_log import KeyframeLog, changed_arrays
 from torchelev.site.keyframes.keyframes import Keyframes, Recorded, correct, record
 from torchelev.site.keyframes.rebuild import rebuild_moved
-from torchelev.site.storage.interface import Note, Overtaken
+from torchelev.site.storage.interface import Note
 from torchelev.site.versioned_site import VersionedSite
 
 if TYPE_CHECKING:
@@ -55,15 +56,7 @@ class KeyframedSite(VersionedSite):
         """
         self._require_keyframes()
         self._require_writable()
-        with self._turn():
-            while True:
-                try:
-                    self._move_keyframes(ids, T_map_base)
-                except Overtaken:
-                    self.refresh()
-                else:
-                    break
-        self._raise_interrupted()
+        self._in_turn(partial(self._move_keyframes, ids, T_map_base))
 
     def _move_keyframes(self, ids: Tensor, T_map_base: Tensor) -> None:
         """Move keyframes of the version that the site shows; Overtaken if it is no longer the newest one."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
@@ -12,11 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchelev.config import ElevationMapConfig
-from torchelev.errors import require, whole_cells
-from torchelev.grid import grid_of
+from torchelev.errors import require
 from torchelev.io.export import SavedMap
 from torchelev.layers import MODES
+from torchelev.site.areas import place_area, save_area
 from torchelev.site.reading import Clock, check_layer, check_layers, read_area, sample_tiles
 from torchelev.site.site_export import Moment, Place, choose_area, export
 from torchelev.site.tiles import TILE, Tiles
@@ -129,24 +127,15 @@ class ReadableSite:
             TypeError: `layers` is one name, not a list.
             ValueError: a length is not a whole number of cells, or the centre is not a point.
         """
-        lengths = {"length_x": length_x, "length_y": length_y}
-        height, width = (whole_cells(name, length, self.resolution) for name, length in lengths.items())
-        point = [float(value) for value in center[:2]]
-        is_point = len(point) == 2 and all(map(math.isfinite, point))
-        require(is_point, "center", "expected x, y in metres", point, "give (0.0, 0.0), say")
-        x, y = (math.floor(c / self.resolution - n / 2 + 0.5) for c, n in zip(point, (height, width), strict=True))
-        return self._copy((x, y), (height, width), check_layers(layers, self._tiles))
+        corner, size = place_area(center, length_x, length_y, self.resolution)
+        return self._copy(corner, size, check_layers(layers, self._tiles))
 
     def _copy(self, corner: tuple[int, int], size: tuple[int, int], names: Sequence[str]) -> SavedMap:
         """Copy an area whose first cell has these numbers on the lattice."""
         area = read_area(self._tiles, corner, size, names, self._clock)
-        grid = grid_of(size, self.resolution)
-        middle = [(c + n / 2) * self.resolution for c, n in zip(corner, size, strict=True)]
         arrays = {name: value.numpy() for name, value in area.items()}
-        config = ElevationMapConfig(
-            grid=grid, channels=self._tiles.channels.configs, levels=self._tiles.levels.cfg
-        ).to_dict()
-        return SavedMap(arrays, self.resolution, np.array([*middle, 0.0]), config)
+        kept = {"channels": self._tiles.channels.configs, "levels": self._tiles.levels.cfg}
+        return save_area(arrays, corner, size, self.resolution, **kept)
 
     def windows(
         self, corner: Int[Tensor, "B 2"], height: int, width: int, layers: Sequence[str]

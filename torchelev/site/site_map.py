@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +15,7 @@ from torchelev.errors import require
 from torchelev.maps.centering import center_on
 from torchelev.ops.masks import count
 from torchelev.ops.storage import keep_freed_memory
+from torchelev.site.areas import require_resolution
 from torchelev.site.channels import SiteChannels
 from torchelev.site.fill_levels import fill_levels
 from torchelev.site.fusion.align import align
@@ -44,7 +45,7 @@ from torchelev.site.shared.ranks import Ranks
 from torchelev.site.shared.shared_merge import gather_tiles, merge_shared
 from torchelev.site.site_config import SiteConfig
 from torchelev.site.site_levels import SiteLevels
-from torchelev.site.storage.interface import InDoubtError, Note, Overtaken
+from torchelev.site.storage.interface import Note
 from torchelev.site.storage.versioned.repository import UncertainCommitError
 from torchelev.site.tiles import LAYERS, locate
 from torchelev.site.times import check_time, continue_time, warn_of_other_clock
@@ -184,22 +185,7 @@ class SiteMap(KeyframedSite, RasterSite):
             OSError: the disk is full; the site is as it was before.
             LostRankError: of a group, another rank has ended; the site is as it was before.
         """
-        with self._turn():
-            while True:
-                try:
-                    report = self._merge(emap, time, align, tilt, T_map_base)
-                except Overtaken:
-                    if self._ranks.size > 1:
-                        raise OSError("site: must have no other writer beside a group, got one: end it") from None
-                    self.refresh()
-                except InDoubtError:
-                    self._is_broken = self._ranks.size > 1  # whose ranks would have to settle it together
-                    raise
-                else:
-                    break
-            self._compact_in_time()
-        self._raise_interrupted()
-        return report
+        return self._in_turn(partial(self._merge, emap, time, align, tilt, T_map_base))
 
     def _merge(
         self, emap: ElevationMap, time: float | None, align: bool, tilt: bool, T_map_base: Tensor | None
@@ -285,18 +271,13 @@ class SiteMap(KeyframedSite, RasterSite):
 
     def require_resolution(self, emap: ElevationMap) -> None:
         """Raise ValueError unless a map has the site's resolution."""
-        actual, rule = emap.cfg.grid.resolution, f"must have the site's resolution, {self.resolution:g} m"
-        require(
-            math.isclose(actual, self.resolution, rel_tol=1e-9), "emap", rule, f"{actual:g} m", "cells must line up"
-        )
+        require_resolution(emap.cfg.grid.resolution, self.resolution)
 
     def _since_epoch(self, time: float) -> float:
         """Return a time that was given, from the epoch. The first one becomes the epoch."""
         if self._has_clock:
             warn_of_other_clock(time, self.time)
-        else:
-            self._epoch, self._time = time, 0.0
-        return time - self._epoch
+        return self._count_from_epoch(time)
 
     def _align(self, windows: Windows, with_offsets: bool, with_tilt: bool) -> Alignment:
         if not with_offsets:

@@ -44,7 +44,7 @@ def warn_of_other_clock(time: float, newest: float) -> None:
     actual = f"{time:.3f}, {abs(passed):.3f} s {where} the site's newest time: {effect}"
     hint = "give all merges seconds of one clock, such as time.time()"
     text = message("time", "must be on the clock of the earlier merges and not go back", actual, hint)
-    warnings.warn(text, RuntimeWarning, stacklevel=7)  # the caller of `merge`, which has two decorators
+    warnings.warn(text, RuntimeWarning, stacklevel=8)  # the caller of `merge`, which has two decorators
 
 
 def continue_time(

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 from weakref import WeakKeyDictionary
 
 from torchelev.errors import message, require
 from torchelev.site.fusion.windows import Contribution
 from torchelev.site.opened_site import OpenedSite
+from torchelev.site.storage.interface import InDoubtError, Overtaken
 
 if TYPE_CHECKING:
     from torchelev.elevation_map import ElevationMap
     from torchelev.site.storage.interface import SiteStore, Version
+
+T = TypeVar("T")
 
 # By map and site: a map's contribution. Of all sites of a process, so that a site may be closed and opened again.
 contributions: WeakKeyDictionary[ElevationMap, dict[str, Contribution]] = WeakKeyDictionary()
@@ -117,6 +120,29 @@ class VersionedSite(OpenedSite):
         return self._store
 
     # Turns -----------------------------------------------------------------------------------------------------------
+
+    def _in_turn(self, work: Callable[[], T]) -> T:
+        """Return what `work` returns, which commits on top of the newest version; overtaken, it is called again.
+
+        Raises:
+            OSError: another process writes beside a group, or as of `work`.
+        """
+        with self._turn():
+            while True:
+                try:
+                    result = work()
+                except Overtaken:
+                    if self._ranks.size > 1:
+                        raise OSError("site: must have no other writer beside a group, got one: end it") from None
+                    self.refresh()
+                except InDoubtError:
+                    self._is_broken = self._ranks.size > 1  # whose ranks would have to settle it together
+                    raise
+                else:
+                    break
+            self._compact_in_time()
+        self._raise_interrupted()
+        return result
 
     @contextmanager
     def _turn(self) -> Iterator[None]:

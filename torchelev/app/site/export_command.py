@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from torchelev.app.site.options import area_option, origin_option
 from torchelev.app.user_error import user_errors
 
 _HELP = """Write an area of a site to a file in the format of its suffix.
@@ -34,23 +35,9 @@ needs torchelev[geo]), .png (with a world file), .ply (a mesh) or .npz.
     metavar="NAME",
     help="Layer or channel to write; repeat it.",
 )
-@click.option(
-    "--area",
-    type=float,
-    nargs=4,
-    metavar="X_MIN X_MAX Y_MIN Y_MAX",
-    help="Part to write [m], map frame.  [default: all that is known]",
-)
+@area_option("Part to write [m], map frame.  [default: all that is known]")
 @click.option("--epsg", type=int, metavar="CODE", help="Projected coordinate system, for .tif.")
-@click.option(
-    "--origin",
-    type=float,
-    nargs=2,
-    default=(0.0, 0.0),
-    show_default=True,
-    metavar="E N",
-    help="Easting and northing of the map frame's origin [m].",
-)
+@origin_option
 @click.option("--version", metavar="ID", help="Id or tag of the version to write.  [default: the newest]")
 def export_command(site: str, out: Path, layers: tuple[str, ...], version: str | None, **options: Any) -> None:
     """Run `torchelev site export`; its help text is `_HELP`."""

@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from torchelev.app.site.options import area_option, origin_option
 from torchelev.app.user_error import user_errors
 
 _HELP = """Fuse a raster, such as a terrain model, into a site as prior ground.
@@ -30,15 +31,7 @@ All of it is stored or nothing. The same heights are taken once.
 @click.option("--layer", metavar="NAME", help="Name of the band or layer, in place of --band.")
 @click.option("--variance", type=float, metavar="M2", help="Variance of the heights [m^2].  [default: 0.09, of 0.3 m]")
 @click.option("--epsg", type=int, metavar="CODE", help="Coordinate system that the file must have.")
-@click.option(
-    "--origin",
-    type=float,
-    nargs=2,
-    default=(0.0, 0.0),
-    show_default=True,
-    metavar="E N",
-    help="Easting and northing of the map frame's origin [m].",
-)
+@origin_option
 @click.option(
     "--height",
     type=float,
@@ -47,13 +40,7 @@ All of it is stored or nothing. The same heights are taken once.
     metavar="M",
     help="Height of the map frame's origin in the raster [m].",
 )
-@click.option(
-    "--area",
-    type=float,
-    nargs=4,
-    metavar="X_MIN X_MAX Y_MIN Y_MAX",
-    help="Part to take [m], map frame.  [default: all of it]",
-)
+@area_option("Part to take [m], map frame.  [default: all of it]")
 @click.option(
     "--time",
     type=float,

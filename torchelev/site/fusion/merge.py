@@ -13,7 +13,7 @@ from torchelev.ops.parallel import map_in_order
 from torchelev.site.fusion.entries import fuse_entries, read_offers, rise
 from torchelev.site.fusion.fuse_levels import Robots, fuse_levels
 from torchelev.site.fusion.fuse_shares import fuse_channels
-from torchelev.site.fusion.pieces import Group, Pieces, group_tiles
+from torchelev.site.fusion.pieces import Group, group_tiles
 from torchelev.site.fusion.shares import Change
 from torchelev.site.fusion.stacks import Change as SurfaceChange
 from torchelev.site.fusion.windows import Alignment, Windows
@@ -90,30 +90,33 @@ def merge_windows(
             robot = fuse_levels(layers, entries, place // size, place, tiles, robots, pieces, rate, cfg)
         bound = layers[_BOUND].clone() if has_bounds and not len(cell) else None
         if has_bounds:
-            lower_bounds(layers, *_read_bounds(windows, alignment, pieces, resolution))
+            bounded, its_place = pieces.find(windows.is_bounded)
+            lower_bounds(layers, bounded, read_bounds(windows, alignment, its_place, resolution))
         fuse_channels(layers, before, layers[_ELEVATION], tiles, pieces, changes)
         contradictions = torch.bincount(robot, minlength=len(alignment.offset))
-        is_same = (
-            bound is not None
-            and can_rest
-            and bool(((bound == layers[_BOUND]) | bound.isnan() & layers[_BOUND].isnan()).all())
-        )
+        is_same = bound is not None and can_rest and torch.equal(_known(bound), _known(layers[_BOUND]))
         return Merged([], values[:, :0], contradictions) if is_same else Merged(pieces.tiles, values, contradictions)
 
     work = ((group, tiles.read(group.tiles)) for group in groups)
     return map_in_order(fuse_group, work) if tiles.device.type == "cpu" else map(fuse_group, work)
 
 
-def _read_bounds(windows: Windows, alignment: Alignment, pieces: Pieces, resolution: float) -> tuple[Tensor, Tensor]:
-    """Return the cells that have an upper bound in the windows, and these bounds in the site's frame."""
-    robot, cell, place = pieces.select(windows.is_bounded)
-    above = rise(windows.known, alignment, robot, place, resolution)
-    return cell, windows.upper_bound.view(-1).index_select(0, place) - above
+def _known(bounds: Tensor) -> Tensor:
+    """Return bounds, infinite where there are none, so that these are equal to each other."""
+    return bounds.nan_to_num(nan=torch.inf)
+
+
+def read_bounds(
+    windows: Windows, alignment: Alignment, place: Int[Tensor, "u"], resolution: float
+) -> Float[Tensor, "u"]:
+    """Return upper bounds at places of the flat windows [m], in the site's frame."""
+    above = rise(windows.known, alignment, place // windows.is_new[0].numel(), place, resolution)
+    return (windows.upper_bound.view(-1).index_select(0, place) - above).float()
 
 
 def lower_bounds(layers: Float[Tensor, "L C"], cell: Int[Tensor, "U"], heights: Float[Tensor, "U"]) -> None:
     """Lower the upper bounds of unknown cells to these heights, in place."""
     if not len(cell):
         return
-    bound = layers[_BOUND].nan_to_num(nan=torch.inf).scatter_reduce(0, cell, heights.to(layers.dtype), "amin")
+    bound = _known(layers[_BOUND]).scatter_reduce(0, cell, heights.to(layers.dtype), "amin")
     layers[_BOUND] = torch.where((layers[_TIME] == layers[_TIME]) | (bound == torch.inf), torch.nan, bound)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +15,7 @@ from torchelev.io.rasters.raster import VARIANCE, Raster
 from torchelev.site.fusion.merge import Merged
 from torchelev.site.rasters.merge_raster import Box, RasterCells, join, merge_raster
 from torchelev.site.site_export import check_box
-from torchelev.site.storage.interface import Note, Overtaken
+from torchelev.site.storage.interface import Note
 from torchelev.site.times import check_time
 from torchelev.site.versioned_site import VersionedSite
 
@@ -103,23 +104,13 @@ class RasterSite(VersionedSite):
         box = self._find_box(opened, area)
         entry = {"name": opened.name, "time": time, "variance": opened.variance, "cells": [*box.first, *box.end]}
         entry["fingerprint"] = opened.fingerprint
-        with self._turn():
-            while True:
-                self._require_first(entry, box)
-                try:
-                    report = self._import_once(opened, box, entry, time)
-                except Overtaken:
-                    self.refresh()
-                else:
-                    break
-            self._compact_in_time()
-        self._raise_interrupted()
-        return report
+        return self._in_turn(partial(self._import_once, opened, box, entry, time))
 
     def _import_once(self, raster: Raster, box: Box, entry: dict[str, Any], time: float | None) -> RasterReport:
         """Fuse a raster into the version that the site shows; Overtaken if it is no longer the newest one."""
+        self._require_first(entry, box)
         before = self._epoch, self._time, self._rasters
-        now = self._begin_at(time)
+        now = 0.0 if time is None else self._count_from_epoch(time)
         self._rasters = [*self._rasters, entry]
         try:
             return self._import(raster, box, now)
@@ -164,10 +155,8 @@ class RasterSite(VersionedSite):
             hint = "leave it out; site.rasters lists what was imported"
             require(not is_same, "raster", rule, f"the heights of {earlier['name']} again", hint)
 
-    def _begin_at(self, time: float | None) -> float:
-        """Return the time of a raster from the epoch; one that is given becomes the epoch if there is none yet."""
-        if time is None:
-            return 0.0
+    def _count_from_epoch(self, time: float) -> float:
+        """Return a time from the epoch; the first one that is given becomes it."""
         if not self._has_clock:
             self._epoch, self._time = time, 0.0
         return time - self._epoch

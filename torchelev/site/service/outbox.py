@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import require
+from torchelev.site.areas import require_resolution
 from torchelev.site.fusion.merge import MergeReport
 from torchelev.site.fusion.windows import Alignment, Contribution, Windows, drop_reset, move_known
 from torchelev.site.service.ledger import OTHER_SITE, TAKEN
@@ -235,10 +236,11 @@ class Outbox:
     def _welcome(self, header: Mapping[str, Any], now: float) -> bool:
         if self.is_welcome:
             return False
-        actual = float(header["resolution"])
-        if abs(actual - self.resolution) > 1e-9 * actual:
-            rule = f"must have the site's resolution, {actual:g} m, got {self.resolution:g} m"
-            self.error = RefusedError(f"emap: {rule}; cells must line up")
+        of_site = float(header["resolution"])
+        try:
+            require_resolution(self.resolution, of_site)
+        except ValueError as error:
+            self.error = RefusedError(str(error))
             return True
         self._site, self._epoch = take_text(header, "site"), take_count(header, "epoch")
         self.version = take_text(header, "version")

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from torchelev.config import ElevationMapConfig
-from torchelev.errors import require, whole_cells
-from torchelev.grid import grid_of
 from torchelev.io.export import SavedMap
+from torchelev.site.areas import place_area, save_area
 from torchelev.site.service.access import check_name
 from torchelev.site.service.messages import MessageError, decode
 from torchelev.site.service.questions import Areas, ask_areas, read_answer
@@ -118,17 +113,9 @@ class SiteReader:
             TimeoutError: no merger has answered.
         """
         resolution = float(self.areas([], 1, 1, [], timeout).about["resolution"])
-        lengths = {"length_x": length_x, "length_y": length_y}
-        H, W = (whole_cells(name, length, resolution) for name, length in lengths.items())
-        point = [float(value) for value in center[:2]]
-        is_point = len(point) == 2 and all(map(math.isfinite, point))
-        require(is_point, "center", "expected x, y in metres", point, "give (0.0, 0.0), say")
-        corner = [math.floor(c / resolution - n / 2 + 0.5) for c, n in zip(point, (H, W), strict=True)]
-        found = self.areas([corner], H, W, layers, timeout).layers
-        middle = [(c + n / 2) * resolution for c, n in zip(corner, (H, W), strict=True)]
-        config = ElevationMapConfig(grid=grid_of((H, W), resolution)).to_dict()
-        arrays = {name: values[0] for name, values in found.items()}
-        return SavedMap(arrays, resolution, np.array([*middle, 0.0]), config)
+        corner, size = place_area(center, length_x, length_y, resolution)
+        found = self.areas([corner], *size, layers, timeout).layers
+        return save_area({name: values[0] for name, values in found.items()}, corner, size, resolution)
 
     def close(self) -> None:
         """Leave the network."""

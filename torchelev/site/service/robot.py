@@ -15,6 +15,7 @@ from torch import Tensor
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
 from torchelev.maps.centering import center_on
+from torchelev.site.areas import require_resolution
 from torchelev.site.fusion.merge import MergeReport
 from torchelev.site.fusion.windows import Known, no_contribution, read_known
 from torchelev.site.initialize_from_site import add_filled, fill, move_contribution
@@ -217,8 +218,7 @@ class RobotLink(SiteReader):
         ids, (H, W) = chosen.nonzero()[:, 0], state.elevation.shape[1:]
         areas = self.areas(state.corner[ids].tolist(), H, W, HEIGHTS)
         now, rate, resolution = (float(areas.about[name]) for name in ("time", "rate", "resolution"))
-        actual, rule = emap.cfg.grid.resolution, f"must have the site's resolution, {resolution:g} m"
-        require(abs(actual - resolution) <= 1e-9 * resolution, "emap", rule, f"{actual:g} m", "cells must line up")
+        require_resolution(emap.cfg.grid.resolution, resolution)
         site = Remembered(*(_spread(areas.layers.get(name), ids, state.elevation) for name in Remembered._fields))
         with self._changed:
             num_resets = emap.num_resets.cpu()[envs]

@@ -69,8 +69,7 @@ class ServedSite(SiteMap):
         windows, latest = received.windows, float(received.windows.known.now.max())
         if self._rate is None:
             self._rate = float(windows.known.rate[0])
-        if not self._has_clock:
-            self._epoch, self._time = latest, 0.0
+        now = self._count_from_epoch(latest)
         windows = _since(self._epoch, windows)
         alignment = _keep_last(self._align(windows, align, tilt), received, align)
         parts = merge_windows(self._tiles, windows, alignment, self.resolution, self._clock.rate, self.cfg)
@@ -78,8 +77,7 @@ class ServedSite(SiteMap):
         number, new_cells = self._num_commits, windows.is_new.flatten(1).sum(1)
         history = describe_merge(len(new_cells), int(new_cells.sum()))
         try:
-            time = max(self._time, latest - self._epoch)
-            contradictions = self._write(parts, time, len(new_cells), note=history)
+            contradictions = self._write(parts, max(self._time, now), len(new_cells), note=history)
         except BaseException:
             if self._num_commits == number:
                 self._robots = before

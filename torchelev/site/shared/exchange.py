@@ -32,17 +32,7 @@ class RankExchange(Exchange):
 
     def gather(self, make: Callable[[], Tensor]) -> list[Tensor]:
         """Return the rows that `make` returns on each rank."""
-        made: list[Tensor] = []
-
-        def count() -> dict[str, int]:
-            made.append(make())
-            return {"rows": len(made[0])}
-
-        numbers = [value["rows"] for value in self._ranks.exchange(_CALL, count)]
-        rows = made[0].new_zeros(max(numbers), *made[0].shape[1:])
-        rows[: len(made[0])] = made[0]
-        gathered = self._ranks.all_gather(_CALL, rows)
-        return [part[:number] for part, number in zip(gathered, numbers, strict=True)]
+        return self._ranks.gather(_CALL, make)
 
     def sum(self, values: Tensor) -> Tensor:
         """Return the sum of the values of all ranks, added up in the order of ranks."""

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.site.fusion.entries import Offers, rise
+from torchelev.site.fusion.entries import Offers
 from torchelev.site.fusion.fuse import Entries, Heights
+from torchelev.site.fusion.merge import read_bounds
 from torchelev.site.fusion.pieces import Pieces
 from torchelev.site.fusion.windows import Alignment, Windows
 from torchelev.site.shared.messages import Shape
@@ -61,12 +62,6 @@ class OwnPart(NamedTuple):
         place = chosen.place[part]
         bound = read_bounds(self.windows, self.alignment, chosen.bound_place[bound_part], self.resolution)
         return Said(self.offers.at(cell, place), place + self.first, bounded, bound)
-
-
-def read_bounds(windows: Windows, alignment: Alignment, place: Tensor, resolution: float) -> Float[Tensor, "u"]:
-    """Return upper bounds at places of the flat windows [m], in the site's frame."""
-    above = rise(windows.known, alignment, place // windows.is_new[0].numel(), place, resolution)
-    return (windows.upper_bound.view(-1).index_select(0, place) - above).float()
 
 
 class SentPart(NamedTuple):

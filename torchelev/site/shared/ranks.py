@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from torch.distributed import ProcessGroup
 
 _MESSAGE_BYTES, _BYTES_OF_RANK, _MAX_TEXT = 2048, 16, 300
+_NOTHING = torch.zeros(0, dtype=torch.uint8)
 _ERRORS = {error.__name__: error for error in (InDoubtError, Overtaken, ValueError, TypeError, KeyError, OSError)}
 
 
@@ -115,14 +116,27 @@ class Ranks:
                 actual = f"{first} on rank 0 and {plans[rank][name]} on rank {rank}"
                 raise ValueError(message(name, "must be the same on all ranks", actual, "call all ranks alike"))
 
+    def gather(self, call: str, make: Callable[[], Tensor]) -> list[Tensor]:
+        """Return the rows (n, ...) that `make` returns on each rank; n may differ. If it raises on one, all raise."""
+        made: list[Tensor] = []
+
+        def count() -> dict[str, int]:
+            made.append(make())
+            return {"rows": len(made[0])}
+
+        numbers = [value["rows"] for value in self.exchange(call, count)]
+        if self.size == 1 or not any(numbers):
+            return made * self.size
+        rows = made[0].new_zeros(max(numbers), *made[0].shape[1:])
+        rows[: len(made[0])] = made[0]
+        gathered = self.all_gather(call, rows)
+        return [part[:number] for part, number in zip(gathered, numbers, strict=True)]
+
     def gather_bytes(self, call: str, data: bytes) -> list[bytes]:
         """Return the bytes of all ranks."""
-        sizes = [value["bytes"] for value in self.exchange(call, lambda: {"bytes": len(data)})]
-        if self.size == 1 or not any(sizes):
-            return [data] if self.size == 1 else [b""] * self.size
-        row = torch.zeros(max(sizes), dtype=torch.uint8)
-        row[: len(data)] = torch.frombuffer(bytearray(data), dtype=torch.uint8) if data else 0
-        return [part.numpy().tobytes()[:size] for part, size in zip(self.all_gather(call, row), sizes, strict=True)]
+        memory = bytearray(data)
+        rows = self.gather(call, lambda: torch.frombuffer(memory, dtype=torch.uint8) if memory else _NOTHING)
+        return [part.numpy().tobytes() for part in rows]
 
     def all_gather(self, call: str, rows: Tensor) -> Tensor:
         """Return the rows (R, ...) of all ranks, on the device of these."""

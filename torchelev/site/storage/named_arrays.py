@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -35,11 +35,7 @@ def check_names(path: Path, names: list[str]) -> None:
 
     Looks at what bears these names alone: a site may have very many arrays.
     """
-    for name in names:
-        parts = name.split("/")
-        is_name = NAME.fullmatch(name) and _CHUNKS not in parts and parts[0] != CELLS
-        rule = f"must be named by letters, digits, _ and -, not {_CHUNKS} or {CELLS}"
-        require(bool(is_name), "arrays", rule, repr(name), 'name them "keyframes/0001", say')
+    require_names(names)
     groups = {"/".join(name.split("/")[:depth]): name for name in names for depth in range(1, name.count("/") + 1)}
     for group, name in groups.items():
         is_array = group in names or _read_kind(path, group) == "array"
@@ -47,6 +43,15 @@ def check_names(path: Path, names: list[str]) -> None:
     for name in names:
         is_group = name in groups or _read_kind(path, name) == "group"
         require(not is_group, "arrays", "must not have arrays below them", repr(name), "choose another name")
+
+
+def require_names(names: Iterable[str]) -> None:
+    """Raise ValueError unless all may be names of arrays."""
+    for name in names:
+        parts = name.split("/")
+        is_name = NAME.fullmatch(name) and _CHUNKS not in parts and parts[0] != CELLS
+        rule = f"must be named by letters, digits, _ and -, not {_CHUNKS} or {CELLS}"
+        require(bool(is_name), "arrays", rule, repr(name), 'name them "keyframes/0001", say')
 
 
 def _read_kind(path: Path, name: str) -> str:

@@ -14,9 +14,10 @@ import numpy as np
 from filelock import FileLock
 from numpy.typing import ArrayLike, NDArray
 
-from torchelev.errors import require
+from torchelev.errors import message, require
 from torchelev.site.storage import named_arrays
 from torchelev.site.storage.interface import Note, Version
+from torchelev.site.storage.shown_version import ShownVersion
 from torchelev.site.storage.site_header import Header, make_site, new_header, read_header, require_empty
 from torchelev.site.storage.tile_files import Tile, TileFiles, as_tiles
 from torchelev.site.storage.transaction import CommitError, clean, finish, lock_folder, stage
@@ -25,7 +26,7 @@ from torchelev.site.storage.zarr_files import METADATA, encode_metadata, import_
 _MAX_WRITES = 32  # tiles that are written at a time
 
 
-class TileStore:
+class TileStore(ShownVersion):
     """A folder of square tiles of layers, to which one process writes while others read.
 
     Tile (a, b) holds cells a * T to a * T + T - 1 along x and b * T to b * T + T - 1 along y; both may be negative.
@@ -104,26 +105,6 @@ class TileStore:
             raise
 
     @property
-    def layers(self) -> tuple[str, ...]:
-        """Names of the L layers."""
-        return self._header.layers
-
-    @property
-    def tile_size(self) -> int:
-        """T, cells on the side of a tile."""
-        return self._header.tile_size
-
-    @property
-    def attributes(self) -> dict[str, Any]:
-        """Attributes of the last commit; of another process' commits, those that `refresh` found."""
-        return dict(self._header.attributes)
-
-    @property
-    def tiles(self) -> frozenset[Tile]:
-        """Tiles that are stored; of another process' tiles, those that `refresh` found."""
-        return self._tiles
-
-    @property
     def num_bytes(self) -> int:
         """Bytes of all files on disk. Looks at each of them: about a millisecond per 100 tiles."""
         return sum(_size(Path(folder, name)) for folder, _, names in os.walk(self.path) for name in names)
@@ -145,29 +126,6 @@ class TileStore:
             ValueError: a tile is damaged; the text names it and its file.
         """
         return self._files.read(as_tiles(tiles))
-
-    def commit(
-        self,
-        tiles: Sequence[Tile] | NDArray,
-        values: ArrayLike,
-        attributes: Mapping[str, Any],
-        arrays: Mapping[str, tuple[NDArray, Mapping[str, Any]]] | None = None,
-    ) -> None:
-        """Store tiles, attributes and arrays together, or none of them if this raises or the process is killed.
-
-        Args:
-            tiles: n different pairs; other tiles stay as they are.
-            values: (n, L, T, T), NaN where unknown.
-            attributes: JSON values, which replace all earlier ones.
-            arrays: further arrays and their attributes by name, such as "keyframes/0001"; others stay as they are.
-
-        Raises:
-            ValueError: an argument breaks its rule, or the store is open read-only or closed.
-            CommitError: the disk is full or cannot be written. All that was stored before is unchanged.
-        """
-        pairs, cells = self._header.check_tiles(as_tiles(tiles), values)
-        with self.transaction(attributes, arrays) as write:
-            write(pairs, cells)
 
     @contextmanager
     def turn(self) -> Iterator[bool]:
@@ -269,11 +227,11 @@ class TileStore:
 
     def tag(self, name: str, version: str) -> None:
         """Raise ValueError: files keep no versions."""
-        self._require_versions("tag")
+        raise self._without_versions("tag")
 
     def rollback(self, version: str) -> str:
         """Raise ValueError: files keep no versions."""
-        return self._require_versions("rollback")
+        raise self._without_versions("rollback")
 
     def compact(self, keep: int) -> int:
         """Return 0: files keep no history."""
@@ -283,10 +241,9 @@ class TileStore:
         """Return False: no commit of files ends in doubt."""
         return False
 
-    def _require_versions(self, call: str) -> str:
+    def _without_versions(self, call: str) -> ValueError:
         hint = f"torchelev site convert {self.path} NEW"
-        require(False, call, "must be of a site with versions", "a site of files", hint)
-        return ""
+        return ValueError(message(call, "must be of a site with versions", "a site of files", hint))
 
     def read_array(self, name: str) -> tuple[NDArray, dict[str, Any]]:
         """Read an array and its attributes as of the last commit; KeyError if there is none of this name."""
@@ -302,12 +259,6 @@ class TileStore:
             if self._lock:
                 self._lock.release()
             self._lock, self.is_closed = None, True
-
-    def __enter__(self) -> TileStore:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
     def _prepare(self, names: list[str]) -> None:
         """Complete a commit that could not be moved into place yet; raise unless another one is possible."""

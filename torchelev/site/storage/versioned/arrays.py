@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -11,21 +11,13 @@ from numpy.typing import NDArray
 from torchelev.errors import require
 from torchelev.site.storage.named_arrays import NAME
 from torchelev.site.storage.site_header import CELLS
+from torchelev.site.storage.versioned.chunks import codecs
 from torchelev.site.storage.zarr_files import require_storable
-
-
-def check_names(names: Sequence[str]) -> None:
-    """Raise ValueError unless all may be names of arrays."""
-    for name in names:
-        is_name = NAME.fullmatch(name) is not None and name.split("/")[0] != CELLS
-        rule, hint = f"must be named by letters, digits, _ and -, not {CELLS}", 'name them "keyframes/0001", say'
-        require(is_name, "arrays", rule, repr(name), hint)
 
 
 def write_array(store: Any, name: str, array: NDArray, attributes: Mapping[str, Any]) -> None:
     """Write an array as one chunk, in place of an earlier one."""
     import zarr
-    from zarr.codecs import BloscCodec, Crc32cCodec
 
     array = np.asarray(array)
     require_storable(array)
@@ -34,7 +26,7 @@ def write_array(store: Any, name: str, array: NDArray, attributes: Mapping[str, 
         name=name,
         data=np.ascontiguousarray(array, array.dtype.newbyteorder("=")),
         chunks=tuple(max(1, size) for size in array.shape) or "auto",
-        compressors=[BloscCodec(cname="lz4", clevel=5, shuffle="shuffle"), Crc32cCodec()],
+        compressors=codecs(),
         attributes=dict(attributes),
         overwrite=True,
     )

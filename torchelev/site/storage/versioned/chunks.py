@@ -18,7 +18,6 @@ _HALF, _CRC = TILES_PER_AXIS // 2, 4  # [tiles], [bytes]
 def create_cells(store: Any, header: Header) -> None:
     """Make the group and its array of all cells, (L, N, N) float32, a chunk for each tile."""
     import zarr
-    from zarr.codecs import BloscCodec, Crc32cCodec
 
     attributes = header.with_attributes({}).metadata()["attributes"]
     zarr.create_group(store, attributes=attributes)
@@ -30,9 +29,16 @@ def create_cells(store: Any, header: Header) -> None:
         chunks=header.tile_shape,
         dtype="float32",
         fill_value=np.nan,
-        compressors=[BloscCodec(cname="lz4", clevel=5, shuffle="shuffle"), Crc32cCodec()],
+        compressors=codecs(),
         dimension_names=["layer", "x", "y"],
     )
+
+
+def codecs() -> list[Any]:
+    """Return the codecs of all arrays, which `zarr_files` writes down for files."""
+    from zarr.codecs import BloscCodec, Crc32cCodec
+
+    return [BloscCodec(cname="lz4", clevel=5, shuffle="shuffle"), Crc32cCodec()]
 
 
 def read_attributes(store: Any) -> dict[str, Any]:

@@ -20,6 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from torchelev.errors import require
 from torchelev.site.storage.interface import Arrays, Note, Overtaken, Tile, Version
+from torchelev.site.storage.named_arrays import require_names
+from torchelev.site.storage.shown_version import ShownVersion
 from torchelev.site.storage.site_header import Header, new_header, parse_header
 from torchelev.site.storage.tile_files import as_tiles
 from torchelev.site.storage.transaction import LOCK
@@ -50,7 +52,7 @@ from torchelev.site.storage.versioned.writing import (
 _MARK = "history/mark"  # an array that changes where attributes alone do: a commit has to change something
 
 
-class VersionedStore:
+class VersionedStore(ShownVersion):
     """An Icechunk repository of square tiles, for several writers and readers, in a folder or an object store.
 
     The newest snapshot of the branch `main` is the newest version. Its group holds the array `cells`, (L, N, N) float32
@@ -68,8 +70,6 @@ class VersionedStore:
         read_only: write nothing.
     """
 
-    _header: Header
-    _tiles: frozenset[Tile]
     _open: Any
 
     engine = "icechunk"
@@ -117,26 +117,6 @@ class VersionedStore:
         return cls(path, version=version, read_only=read_only)
 
     # What it shows ---------------------------------------------------------------------------------------------------
-
-    @property
-    def layers(self) -> tuple[str, ...]:
-        """Names of the L layers."""
-        return self._header.layers
-
-    @property
-    def tile_size(self) -> int:
-        """T, cells on the side of a tile."""
-        return self._header.tile_size
-
-    @property
-    def attributes(self) -> dict[str, Any]:
-        """Attributes of the version that it shows."""
-        return dict(self._header.attributes)
-
-    @property
-    def tiles(self) -> frozenset[Tile]:
-        """Tiles of the version that it shows."""
-        return self._tiles
 
     @property
     def version(self) -> str:
@@ -200,17 +180,6 @@ class VersionedStore:
         with self._mutex, nullcontext() if self._lock is None else hold(self._lock, self.path):
             yield
 
-    def commit(
-        self,
-        tiles: Sequence[Tile] | NDArray,
-        values: ArrayLike,
-        attributes: Mapping[str, Any],
-        arrays: Arrays | None = None,
-    ) -> None:
-        """Store tiles, attributes and arrays together; arguments and errors as of `TileStore.commit`."""
-        with self.transaction(attributes, arrays) as write:
-            write(tiles, values)
-
     @contextmanager
     def transaction(
         self, attributes: Mapping[str, Any], arrays: Arrays | None = None, note: Note | None = None
@@ -236,7 +205,7 @@ class VersionedStore:
         require(
             not self._read_only, str(self.path), "must be open for writing", "a store that is read-only or closed", hint
         )
-        named.check_names(list(arrays or {}))
+        require_names(arrays or {})
         written: set[Tile] = set()
         with self._alone(), errors_in_words(self.path):
             session = self._repository.writable_session("main")
@@ -309,12 +278,6 @@ class VersionedStore:
         """Write no more. Reading stays possible."""
         with self._mutex:
             self._read_only = self.is_closed = True
-
-    def __enter__(self) -> VersionedStore:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
     # Versions --------------------------------------------------------------------------------------------------------
 
