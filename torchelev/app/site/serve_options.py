@@ -15,7 +15,7 @@ around them. Needs torchelev[serve].
 \b
   torchelev site serve hill/                            this machine alone
   torchelev site serve hill/ --listen tcp/10.0.0.5:7450
-  torchelev site serve hill/ --connect tcp/127.0.0.1:7447    a router, as of rmw_zenoh
+  torchelev site serve hill/ --connect tcp/127.0.0.1:7447    a router, such as rmw_zenoh's
   torchelev site serve hill/ --robots robots.yaml       only these robots may write
 
 What a robot is told to be merged is on disk. Ctrl-C ends it after the merge

@@ -45,8 +45,8 @@ def check_sender(message: Message, delivered_as: str | None, keys: Mapping[str, 
     """Return the robot whose message it is.
 
     Args:
-        message: as it came.
-        delivered_as: name of the robot by whose key of the network it came; None: not known.
+        message: decoded.
+        delivered_as: name of the robot under which the network delivered it; None: not known.
         keys: of the robots that may write; None: all may.
 
     Raises:

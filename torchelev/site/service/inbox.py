@@ -13,8 +13,8 @@ MAX_BYTES = 1 << 28
 class Entry(NamedTuple):
     """A message, or a question and who is told the answer."""
 
-    payload: bytes  #: as it came
-    robot: str | None  #: whose key of the network it came by; None: it came by another way
+    payload: bytes  #: its bytes
+    robot: str | None  #: under whose name the network delivered it; None: not known
     answer: Callable[[bytes], None] | None  #: is called with the answer to a question; None: no question
 
 

@@ -1,4 +1,4 @@
-"""What the windows of one rank say of the tiles of one rank: the rank's own, and those that were sent."""
+"""What the windows of one rank measured on the tiles of one rank: the rank's own, and those that were sent."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
 
-class Said(NamedTuple):
-    """What windows say of a group of tiles."""
+class Evidence(NamedTuple):
+    """What windows measured on a group of tiles."""
 
     entries: Entries  #: heights
     place: Int[Tensor, "k"]  #: of them in the flat windows of all ranks
@@ -39,13 +39,13 @@ class Chosen(NamedTuple):
 
 
 def choose_cells(windows: Windows, pieces: Pieces) -> Chosen:
-    """Return the cells of pieces that have something to say."""
+    """Return the cells of pieces that are new or have an upper bound."""
     tiles = torch.tensor(pieces.tiles, dtype=torch.int64, device=pieces.cell.device).view(-1, 2)
     return Chosen(tiles, *pieces.find(windows.is_new), *pieces.find(windows.is_bounded))
 
 
 class OwnPart(NamedTuple):
-    """What a rank's windows say of its own tiles, which is read from them group by group."""
+    """What a rank's windows measured on its own tiles, which is read from them group by group."""
 
     chosen: Chosen  #: cells on its tiles
     windows: Windows  #: of its robots
@@ -54,18 +54,18 @@ class OwnPart(NamedTuple):
     first: int  #: place of the rank's first cell in the flat windows of all ranks
     resolution: float  #: [m]
 
-    def at(self, group: Int[Tensor, "g 2"]) -> Said:
-        """Return what it says of a group of tiles."""
+    def at(self, group: Int[Tensor, "g 2"]) -> Evidence:
+        """Return what it measured on a group of tiles."""
         chosen = self.chosen
         cell, part = cut_cells(chosen.tiles, chosen.cell, group)
         bounded, bound_part = cut_cells(chosen.tiles, chosen.bounded, group)
         place = chosen.place[part]
         bound = read_bounds(self.windows, self.alignment, chosen.bound_place[bound_part], self.resolution)
-        return Said(self.offers.at(cell, place), place + self.first, bounded, bound)
+        return Evidence(self.offers.at(cell, place), place + self.first, bounded, bound)
 
 
 class SentPart(NamedTuple):
-    """What another rank's windows say of tiles: 24 bytes for each cell that is new, 36 once a robot has contributed."""
+    """What another rank's windows measured on tiles: 24 bytes for each cell that is new, 36 once a robot has contributed."""
 
     tiles: Int[Tensor, "n 2"]  #: in ascending order
     cell: Int[Tensor, "K"]  #: number of the tile * CELLS + number of the cell, by tiles, int32
@@ -74,14 +74,14 @@ class SentPart(NamedTuple):
     bounded: Int[Tensor, "U"]  #: cells that have an upper bound, by tiles, int32
     bound: Float[Tensor, "U"]  #: [m] in the site's frame
 
-    def at(self, group: Int[Tensor, "g 2"]) -> Said:
-        """Return what it says of a group of tiles."""
+    def at(self, group: Int[Tensor, "g 2"]) -> Evidence:
+        """Return what it measured on a group of tiles."""
         cell, part = cut_cells(self.tiles, self.cell, group)
         bounded, bound_part = cut_cells(self.tiles, self.bounded, group)
         values = self.values[:, part]
         contributed = Heights(*values[4:]) if len(values) > 4 else None
         entries = Entries(cell, Heights(*values[:3]), values[3], contributed)
-        return Said(entries, self.place[part].long(), bounded, self.bound[bound_part])
+        return Evidence(entries, self.place[part].long(), bounded, self.bound[bound_part])
 
     @staticmethod
     def shapes(chosen: Chosen, number: int) -> list[Shape]:

@@ -56,11 +56,13 @@ def merge_shared(
 
     def fuse_group(group_and_values: tuple[Tensor, Tensor]) -> Merged:
         group, values = group_and_values
-        said = [part.at(group) for part in parts]
+        evidence = [part.at(group) for part in parts]
         layers = values.flatten(1)
-        is_contradicted = fuse_entries(layers, join_entries([part.entries for part in said]), rate, cfg)
-        lower_bounds(layers, torch.cat([part.bounded for part in said]), torch.cat([part.bound for part in said]))
-        robot = torch.cat([part.place for part in said])[is_contradicted] // size
+        is_contradicted = fuse_entries(layers, join_entries([part.entries for part in evidence]), rate, cfg)
+        lower_bounds(
+            layers, torch.cat([part.bounded for part in evidence]), torch.cat([part.bound for part in evidence])
+        )
+        robot = torch.cat([part.place for part in evidence])[is_contradicted] // size
         return Merged(_as_tiles(group), values, torch.bincount(robot, minlength=num_robots))
 
     work = ((group, tiles.read(_as_tiles(group))) for group in groups)
@@ -74,7 +76,7 @@ def _as_tiles(numbers: Tensor) -> list[Tile]:
 def _deal(
     windows: Windows, alignment: Alignment, first: int, resolution: float, exchange: Exchange
 ) -> list[OwnPart | SentPart]:
-    """Send what this rank's windows say of the others' tiles; return what all say of its own, in the order of ranks."""
+    """Send what this rank's windows measured on the others' tiles; return what all measured on its own, in the order of ranks."""
     own: list[OwnPart] = []
 
     def send() -> tuple[UInt8[Tensor, "n"], list[int]]:
