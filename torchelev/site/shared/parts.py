@@ -65,7 +65,10 @@ class OwnPart(NamedTuple):
 
 
 class SentPart(NamedTuple):
-    """What another rank's windows measured on tiles: 24 bytes for each cell that is new, 36 once a robot has contributed."""
+    """What another rank's windows measured on tiles.
+
+    24 bytes for each cell that is new, 36 once a robot has contributed.
+    """
 
     tiles: Int[Tensor, "n 2"]  #: in ascending order
     cell: Int[Tensor, "K"]  #: number of the tile * CELLS + number of the cell, by tiles, int32

@@ -76,7 +76,7 @@ def _as_tiles(numbers: Tensor) -> list[Tile]:
 def _deal(
     windows: Windows, alignment: Alignment, first: int, resolution: float, exchange: Exchange
 ) -> list[OwnPart | SentPart]:
-    """Send what this rank's windows measured on the others' tiles; return what all measured on its own, in the order of ranks."""
+    """Send what this rank measured on the others' tiles; return what all measured on its own, in the order of ranks."""
     own: list[OwnPart] = []
 
     def send() -> tuple[UInt8[Tensor, "n"], list[int]]:
