@@ -96,7 +96,7 @@ class SentPart(NamedTuple):
         ]  # fmt: skip
 
     def write(self, chosen: Chosen, own: OwnPart) -> None:
-        """Write what windows say of chosen cells into this part."""
+        """Write what windows measured on chosen cells into this part."""
         self.tiles.copy_(chosen.tiles)
         self.cell.copy_(chosen.cell)
         self.place.copy_(chosen.place).add_(own.first)
