@@ -17,6 +17,12 @@ from torchelev.site.storage.zarr_files import encode_json
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 _LOG = "history/rollbacks"  # name of an array
+# What collecting holds in memory: by default, 400 merges over a square kilometre end with 190 MB more.
+_FEW_AT_A_TIME = {
+    "max_snapshots_in_memory": 1,
+    "max_compressed_manifest_mem_bytes": 1 << 20,
+    "max_concurrent_manifest_fetches": 1,
+}
 _LONGEST_MERGE = timedelta(minutes=10)  # chunks of an object store that are younger may belong to a commit on its way
 
 
@@ -130,7 +136,8 @@ def compact(repository: Any, keep: int, *, is_alone: bool) -> int:
         return 0
     repository.expire_snapshots(min(newest))  # by the writers' clocks: of one that was wrong, rather too few
     now = datetime.now(timezone.utc)
-    return int(repository.garbage_collect(now if is_alone else now - _LONGEST_MERGE).bytes_deleted)
+    found = repository.garbage_collect(now if is_alone else now - _LONGEST_MERGE, **_FEW_AT_A_TIME)
+    return int(found.bytes_deleted)
 
 
 def _read_tags(repository: Any) -> dict[str, tuple[str, ...]]:
