@@ -148,8 +148,8 @@ def open_storage(path: str | Path) -> Any:
 def configuration() -> Any:
     """Return the settings of a repository.
 
-    One request for a chunk, as splitting those of small ones takes longer. Small caches: by default, those of the
-    references of chunks grow by a megabyte with each merge into a site of 10,000 tiles.
+    One request for a chunk, as splitting those of small ones takes longer. Small caches: by default, 200 merges into a
+    site of 11,000 tiles end with 50 MB more.
     """
     icechunk = import_icechunk()
     one = icechunk.StorageConcurrencySettings(
