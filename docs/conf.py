@@ -26,7 +26,7 @@ exclude_patterns = ["_build", "extensions", "pictures/README.md"]
 nitpicky = True
 # Without a page: other libraries' names, and types of this one's that only its own functions pass on.
 _INTERNAL = (
-    r"torchelev\.(observations\.patterns|planes\.local_planes|traversability\.weight_file|completion\.parameters|stages"
+    r"torchelev\.(observations\.patterns|planes\.local_planes|traversability\.weight_file|stages"
     r"|filters\.registry|io\.files\.arrays|io\.folders\.clock|site\.service\.(answers|questions|transport))\."
 )
 nitpick_ignore_regex = [("py:obj", ".*"), ("py:.*", r"^(?!torchelev\.).*"), ("py:class", rf"{_INTERNAL}.*")]

@@ -13,7 +13,6 @@ from typing import Any
 
 from docs.extensions.fields import comments
 from torchelev.channels.config import DTYPES, KINDS, ChannelConfig
-from torchelev.completion.config import WHEN
 from torchelev.config import ElevationMapConfig, setting_types
 from torchelev.files.config_files import SCHEMA_NAME, VERSION, VERSION_NAME, to_json
 from torchelev.kernels.registry import PACKAGE
@@ -31,7 +30,7 @@ _FILTERS = {
         },
     },
 }
-_CHOICES: dict[str, Any] = {"when": list(WHEN), "kind": list(KINDS), "dtype": list(DTYPES)}
+_CHOICES: dict[str, Any] = {"kind": list(KINDS), "dtype": list(DTYPES)}
 _NUMBER = {"anyOf": [{"type": "number"}, {"enum": ["inf", "-inf"]}]}
 _SIMPLE: dict[Any, dict[str, Any]] = {
     float: {"$ref": "#/$defs/number"},

@@ -29,8 +29,9 @@ from benchmarks.quality.changes import report as changes
 from benchmarks.quality.isaac_lab import report as isaac_lab
 from benchmarks.quality.levels import __main__ as levels
 from benchmarks.quality.levels import one_height
+from benchmarks.quality.occlusion import report as occlusion
 from benchmarks.quality.odometry import report as odometry
-from benchmarks.quality.real import completed, merged
+from benchmarks.quality.real import merged
 from benchmarks.runtime import report as runtime
 from benchmarks.runtime import spacing
 from benchmarks.self_filter import __main__ as self_filter
@@ -38,7 +39,6 @@ from benchmarks.self_filter import walking
 from benchmarks.speed import (
     bags,
     channels,
-    completion,
     encoders,
     growth,
     head,
@@ -54,8 +54,6 @@ from benchmarks.speed.postprocessing import __main__ as postprocessing
 from benchmarks.speed.site import site_area, site_engines, site_merge, site_ranks, site_service
 from benchmarks.speed.update import tables
 from torchelev.app.results import markdown_table
-from training.completion import edges
-from training.completion import evaluate as filling
 from training.nav import ceiling_experiment, encoder_experiment, experiment, fill_experiment
 from training.quadruped import experiment as legs
 from training.quadruped import fills, step_time
@@ -102,11 +100,9 @@ def _real() -> str:
 
 
 def _occlusion() -> str:
-    """Tabulate how often each rule for unknown ground is right over whole walks [%]."""
-    right = load("occlusion")["right [%]"]
-    kinds = list(next(iter(right.values())))
-    rows = [[rule, *(f"{rates[kind]['whole walk']:.0f}" for kind in kinds)] for rule, rates in right.items()]
-    return markdown_table(["rule for unknown ground", *kinds], rows)
+    """Tabulate how often each rule for unknown ground is right [%]."""
+    found = load("occlusion")
+    return occlusion.table(found["right [%]"], found["footholds within 3 cm [%]"])
 
 
 def _speed() -> str:
@@ -193,10 +189,6 @@ TABLES = {
     "site_ranks": _made_by(site_ranks.table, "site_ranks"),
     "site_service": _made_by(site_service.table, "site_service"),
     "real_merged": _made_by(merged.table, "real_merged", "rows"),
-    "completion": _made_by(filling.summary, "completion", folder=training.RESULTS),
-    "completion_edges": _made_by(edges.table, edges.NAME, folder=training.RESULTS),
-    "completion_speed": _made_by(completion.table, "completion_speed", "rows"),
-    "real_completed": _made_by(completed.table, "real_completed", "rows"),
     "nav": _made_by(experiment.table, "nav", folder=training.RESULTS),
     "pose_covariance": _made_by(pose_covariance.table, "pose_covariance"),
     "legs": _made_by(legs.table, "quadruped", folder=training.RESULTS),

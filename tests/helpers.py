@@ -7,7 +7,7 @@ import time
 import numpy as np
 import torch
 
-from torchelev import CompletionConfig, CompletionNet, ElevationMap, ElevationMapConfig, GridConfig
+from torchelev import ElevationMap, ElevationMapConfig, GridConfig
 from torchelev.state import MapState, Statistics, blank_state
 
 
@@ -17,18 +17,10 @@ def small_config(cells=(12, 10), resolution=0.1, **stages):
     return ElevationMapConfig(grid=grid, **stages)
 
 
-def small_map(num_envs=1, cells=(12, 10), resolution=0.1, dtype=torch.float32, completion_net=None, **stages):
+def small_map(num_envs=1, cells=(12, 10), resolution=0.1, dtype=torch.float32, **stages):
     """A map of a small window."""
     cfg = small_config(cells, resolution, **stages)
-    return ElevationMap(cfg, num_envs=num_envs, completion_net=completion_net).to(dtype)
-
-
-def with_completion(seed=0, **settings):
-    """What `small_map` needs for completion, by a network of random weights."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        net = CompletionNet(view_channels=5, cell_channels=7, measured_channels=4).requires_grad_(False)
-    return dict(completion=CompletionConfig(**settings), completion_net=net)
+    return ElevationMap(cfg, num_envs=num_envs).to(dtype)
 
 
 def rotation(yaw=0.0, pitch=0.0, roll=0.0):

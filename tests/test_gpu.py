@@ -4,13 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.speed.completion import make_maps
 from tests.devices import OneDevice
-from tests.helpers import pose, random_poses, small_config, with_completion
+from tests.helpers import pose, random_poses, small_config
 from tests.robot_body.bodies import random_body
 from tests.site.helpers import known_cells, robots
-from torchelev import BodyConfig, CompletionNet, ElevationMap, HeightScan, MapImage, SensorConfig
-from torchelev.completion.surroundings import count_steps
+from torchelev import BodyConfig, ElevationMap, SensorConfig
 from torchelev.site import SiteMap
 
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
@@ -18,7 +16,6 @@ needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CU
 
 def forbid_reading(monkeypatch):
     """Make what copies values raise: constants made on the host, for which it waits."""
-    monkeypatch.setattr("torchelev.completion.complete.count_steps", count_steps.__wrapped__)
     for constructor in ("tensor", "as_tensor", "from_numpy"):
         monkeypatch.setattr(torch, constructor, None)
 
@@ -50,41 +47,6 @@ def test_links_are_not_read_back(monkeypatch):
     links = torch.empty(5, len(body.links), 4, 4, device="meta")
     with OneDevice():
         emap.update(cloud, T, T[:, 0], 0.1, T_base_links=links)
-
-
-SCAN = HeightScan.isaac_lab(length_x=1.0, length_y=0.5, resolution=0.1, fill="completed")
-IMAGE = MapImage(length_x=0.8, length_y=0.8, layers=("completed", "completed_std"))
-
-
-def completing_map(num_envs, device, **settings):
-    parts = with_completion(**settings)
-    net = parts.pop("completion_net")
-    return ElevationMap(small_config((40, 40), 0.05, **parts), num_envs, device, completion_net=net)
-
-
-@pytest.mark.slow(3)
-@pytest.mark.parametrize("when", ["read", "update"])
-def test_completion_copies_nothing_from_the_host(monkeypatch, when):
-    emap = completing_map(5, "meta", when=when)
-    read_completed(emap)  # a reader copies its pattern once
-    forbid_reading(monkeypatch)
-    monkeypatch.setattr(torch.Tensor, "new_tensor", None)
-    read_completed(emap)
-
-
-@pytest.mark.slow(1)
-def test_completion_reads_no_values_back():
-    read_completed(completing_map(5, "meta"))
-
-
-def read_completed(emap):
-    B, device = emap.num_envs, emap.device
-    cloud, T = torch.empty(B, 100, 3, device=device), torch.empty(B, 4, 4, device=device)
-    with OneDevice():
-        emap.update(cloud, T, T, 0.1)
-        assert emap.layer("completed").shape == emap.layer("completed_std", state=emap.state).shape == (B, 40, 40)
-        emap.sample(torch.empty(B, 7, 2, device=device), "completed")
-        assert SCAN(emap, T)[0].shape == (B, SCAN.num_points) and IMAGE(emap, T).shape == (B, 2, 16, 16)
 
 
 def drive(emap, updates=4, seed=0):
@@ -176,21 +138,6 @@ def test_captured_update_equals_plain():
 
 
 @needs_gpu
-@pytest.mark.parametrize("when", ["read", "update"])
-def test_captured_completion_equals_that_of_the_cpu(when):
-    on_cpu, on_gpu = (drive(completing_map(3, device, when=when)) for device in ("cpu", "cuda"))
-    cloud, T = torch.rand(3, 300, 3, device="cuda") - 0.5, pose(num_envs=3).cuda()
-    graph = torch.cuda.CUDAGraph()
-    on_gpu.layer("completed")  # before the capture, so that all is loaded
-    with torch.cuda.graph(graph):
-        on_gpu.update(cloud, T, T, 0.1)
-        completed = on_gpu.layer("completed")
-    graph.replay()
-    on_cpu.load_state(on_gpu.state)
-    torch.testing.assert_close(completed.cpu(), on_cpu.layer("completed"), atol=1e-4, rtol=0)
-
-
-@needs_gpu
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
 def test_a_site_takes_maps_of_a_gpu_and_gives_back(device):
     maps = [robots([(0, 0), (20, 10)], offsets=[0.1, -0.1], noise=0.003) for _ in range(2)]
@@ -202,13 +149,3 @@ def test_a_site_takes_maps_of_a_gpu_and_gives_back(device):
     newcomer = ElevationMap(small_config((20, 20)), 1, "cuda")
     newcomer.initialize_from(sites[1], pose((2.0, 2.0, 0.5)).cuda())
     assert newcomer.state.validity.any()
-
-
-@needs_gpu
-@pytest.mark.parametrize("maps, size", [(1, 250), (16, 64)])
-def test_completion_compiles(maps, size):
-    net = CompletionNet.from_pretrained().requires_grad_(False).cuda()
-    layers = [layer.cuda() for layer in make_maps(maps, size)]
-    expected, completed = (run(*layers, resolution=0.04) for run in (net, torch.compile(net)))
-    for one, other in zip(expected, completed, strict=True):
-        torch.testing.assert_close(one, other, atol=1e-4, rtol=0)

@@ -19,7 +19,6 @@ SHORTER = {
 LONG = {  # what must be shortened, by notebook
     "01_map_in_the_loop": "ITERATIONS = 60",
     "03_traversability": "BATCHES, STEPS = 24, 600",
-    "06_completion": "WALKS, STEPS = 12, 1500",
 }
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 

@@ -13,7 +13,6 @@ import torchelev
 
 ROOT = Path(__file__).parents[1]
 ROOMS = (  # that a map does not need unless its config asks for them
-    "torchelev.completion.net",
     "torchelev.diagnosis.causes",
     "torchelev.filters",
     "torchelev.observations",
@@ -36,7 +35,7 @@ emap.layer("traversability"), emap.rate(), emap.sample(torch.zeros(2, 3, 2)), em
 print_found({ROOMS + COMPILER})
 filters = [torchelev.FilterConfig(layer=name, filter=name) for name in FILTERS]
 cfg = torchelev.ElevationMapConfig(
-    traversability=torchelev.LearnedTraversabilityConfig(), completion=torchelev.CompletionConfig(), filters=filters
+    traversability=torchelev.LearnedTraversabilityConfig(), filters=filters
 )
 emap = torchelev.ElevationMap(cfg, 2)
 emap.update(points, T, T, 0.1)
@@ -49,7 +48,7 @@ print_found({ROOMS})
 print_found({COMPILER})
 """
 FILTERS = ("inpaint_minimum", "inpaint_nearest", "inpaint_diffusion")
-FILLS = ("ground", "base", "lowest", "upper_bound", "inpaint", "completed", "original")
+FILLS = ("ground", "base", "lowest", "upper_bound", "inpaint", "original")
 
 
 @pytest.mark.slow(4)

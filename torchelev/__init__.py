@@ -8,8 +8,6 @@ from torchelev.lazy_names import import_later
 
 if TYPE_CHECKING:
     from torchelev.channels.config import ChannelConfig
-    from torchelev.completion.config import CompletionConfig
-    from torchelev.completion.net import CompletionNet
     from torchelev.config import ElevationMapConfig
     from torchelev.elevation_map import ElevationMap
     from torchelev.filters.chain import FilterConfig
@@ -38,8 +36,6 @@ __all__ = [
     "Box",
     "Capsule",
     "ChannelConfig",
-    "CompletionConfig",
-    "CompletionNet",
     "DepthConfig",
     "DriftConfig",
     "EdgeConfig",
@@ -80,8 +76,6 @@ _LATER = {
     "Box": "torchelev.robot_body.shapes",
     "Capsule": "torchelev.robot_body.shapes",
     "ChannelConfig": "torchelev.channels.config",
-    "CompletionConfig": "torchelev.completion.config",
-    "CompletionNet": "torchelev.completion.net",
     "DepthConfig": "torchelev.stages.measure.config",
     "DriftConfig": "torchelev.stages.compensate.config",
     "EdgeConfig": "torchelev.stages.fusion.config",

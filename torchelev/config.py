@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchelev.channels.config import ChannelConfigs, parse_channels
-from torchelev.completion.config import CompletionConfig
 from torchelev.errors import require
 from torchelev.files.config_files import from_json, read_settings, without_header, write_settings
 from torchelev.grid import GridConfig
@@ -36,7 +35,7 @@ if TYPE_CHECKING:
 class ElevationMapConfig:
     """Configuration of all stages of a map.
 
-    `drift`, `raycast`, `overlap`, `traversability`, `completion`, `levels` and `fusion.edges` can be None, which
+    `drift`, `raycast`, `overlap`, `traversability`, `levels` and `fusion.edges` can be None, which
     switches that stage off.
 
     Raises:
@@ -59,8 +58,6 @@ class ElevationMapConfig:
     traversability: TraversabilityConfig | LearnedTraversabilityConfig | None = field(
         default_factory=TraversabilityConfig
     )
-    #: the layers `completed` and `completed_std`: predicted ground where no sensor saw it; None: none
-    completion: CompletionConfig | None = None
     levels: LevelsConfig | None = None  #: surfaces of a cell besides the ground, such as ceilings; None: none
     filters: tuple[FilterConfig, ...] = ()  #: further layers, computed when they are read: see `torchelev.filters`
     #: what each cell holds besides its height, by name: `ChannelConfig`, or the word of a kind with its defaults
@@ -72,7 +69,7 @@ class ElevationMapConfig:
         hint = "give (FilterConfig(layer=..., filter=...), ...)"
         is_chain = _is_chain(self.filters)
         require(is_chain, "cfg.filters", "must be a tuple of FilterConfig", repr(self.filters), hint, TypeError)
-        taken = (*LAYERS, "completed", "completed_std", *(step.layer for step in self.filters))
+        taken = (*LAYERS, *(step.layer for step in self.filters))
         object.__setattr__(self, "channels", parse_channels(self.channels, taken))
         for name, annotation in setting_types(type(self)).items():  # type: ignore[arg-type]
             if name in ("filters", "channels"):
@@ -81,8 +78,6 @@ class ElevationMapConfig:
             rule = f"must be {' or '.join('None' if kind is type(None) else f'a {kind.__name__}' for kind in kinds)}"
             hint = "give an object, or build the whole with ElevationMapConfig.from_dict"
             require(isinstance(value, annotation), f"cfg.{name}", rule, repr(value), hint, TypeError)
-        if self.completion is not None:
-            self.completion.require_resolution(self.grid.resolution)
         if self.raycast is not None:
             self.raycast.require_grid(self.grid)
             fits = self.raycast.steps is None or self.fusion.averaging is not None
@@ -126,7 +121,8 @@ class ElevationMapConfig:
             values = without_header(values)
         if not isinstance(values, dict):
             return _build(cls, values, "config")
-        stages = {name: value for name, value in values.items() if name not in ("filters", "channels")}
+        other = ("filters", "channels", *(("completion",) if values.get("completion") is None else ()))  # of old files
+        stages = {name: value for name, value in values.items() if name not in other}
         own: dict[str, Any] = {"channels": values["channels"]} if values.get("channels") is not None else {}
         if "filters" in values:
             from torchelev.filters.chain import filters_from_list  # a map without filters needs none of them

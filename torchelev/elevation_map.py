@@ -41,15 +41,13 @@ from torchelev.maps.buffers import without_shared_memory
 from torchelev.maps.restarts import RestartableMap
 from torchelev.ops.storage import keep_freed_memory
 from torchelev.ops.transforms import is_readable, require_reverse_mode
-from torchelev.pipeline import update_by_tensors, update_in_place, write
-from torchelev.stages.complete import forget_completed
+from torchelev.pipeline import update_by_tensors, update_in_place
 from torchelev.stages.measure.stage import find_own, measure, time_step
 from torchelev.state import MapState, Measurement, map_layers
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-    from torchelev.completion.net import CompletionNet
     from torchelev.traversability.net import TraversabilityNet
     from torchelev.traversability.weight_file import Weights
 
@@ -67,8 +65,6 @@ class ElevationMap(RestartableMap):
         chunk: update at most this many environments at a time, to save memory; results agree up to rounding. None: all
             on a GPU, and on a CPU as many as are fastest. C++ updates one map at a time whatever this is.
         head: trained traversability head, used as it is and not copied, in place of the weights that `cfg` names.
-        completion_net: trained completion network, used as it is and not copied, in place of the weights that `cfg`
-            names.
 
     Raises:
         TypeError: if `cfg` is no ElevationMapConfig.
@@ -85,18 +81,17 @@ class ElevationMap(RestartableMap):
         check_values: bool = False,
         chunk: int | None = None,
         head: TraversabilityNet | None = None,
-        completion_net: CompletionNet | None = None,
     ) -> None:
         cfg = checks.given_or_default(ElevationMapConfig, cfg)
         num_envs = require_count("num_envs", num_envs, "give the number of maps")
         survive_forks()
-        super().__init__(cfg, num_envs, device, head, completion_net)
+        super().__init__(cfg, num_envs, device, head)
         self.check_values = check_values
         self.chunk = None if chunk is None else require_count("chunk", chunk, "give a number of environments, or None")
         self.update_times = UpdateTimes()
         self._links = cfg.sensor.links
         # Compiled stages are shared by maps of equal ones.
-        self._update_cfg = dataclasses.replace(cfg, completion=None, filters=(), channels=ChannelConfigs(), levels=None)
+        self._update_cfg = dataclasses.replace(cfg, filters=(), channels=ChannelConfigs(), levels=None)
         if self.levels is not None:  # which choose the floor, and keep the others
             self._update_cfg = dataclasses.replace(self._update_cfg, overlap=None)
         self._only_by_tensors = pipeline.only_by_tensors(cfg)
@@ -165,21 +160,15 @@ class ElevationMap(RestartableMap):
         if is_readable(self.elevation):
             keep_freed_memory(self._num_bytes)
         weights = None if self._weights is None else self._weights.detached()
-        before = self._take_out_predictions()
         # A seventh faster than `no_grad`, as views need no bookkeeping; the buffers stay normal tensors.
         with torch.inference_mode():
             measured = inputs if self.levels is None else self.levels.sort_points(state, inputs, self._recenter)
             self._run_stages(state, measured, weights)
             if self.levels is not None:
                 self.levels.follow_drift(state)
-        if before is not None:
-            with torch.no_grad():
-                write(state, self._write_back(before, state))
         if self.channels is not None:
             own = find_own(inputs, self.cfg.sensor) if brought else None
             self.channels.update(self.state, time_step(inputs.dt, torch.float32), inputs, own, brought)
-        if self.cfg.completion is not None and self.cfg.completion.when == "update":
-            self._complete()
 
     def _run_stages(self, state: MapState, inputs: Inputs, weights: Weights | None) -> None:
         """Update a state of these maps by the backend that suits it."""
@@ -198,15 +187,6 @@ class ElevationMap(RestartableMap):
         """Restore a copy or an unpickled map, whose process may know its config by another key."""
         super().__setstate__(state)
         self._key = pipeline.register_stages(self._update_cfg)
-
-    def _take_out_predictions(self) -> MapState | None:
-        """Make the cells that completion filled unknown, and return a copy of the state with them; None without."""
-        if not self._writes_back:
-            return None
-        with torch.no_grad():
-            before = map_layers(Tensor.clone, self.state)
-            write(self.state, self.measured_state)
-        return before
 
     @requires_dt
     def measure(
@@ -258,10 +238,7 @@ class ElevationMap(RestartableMap):
         hint = "measure with a map of that dtype"
         require(other == dtype, "measurement", f"must be of the state's dtype, {dtype}", other, hint, TypeError)
         require_reverse_mode((*state[:-1], *state.statistics, *measurement, *(levels or ()), *(self._weights or ())))
-        before, state = state, forget_completed(state) if self._writes_back else state
         new, surfaces = self._fuse(state, measurement, levels)
-        if self._writes_back:
-            new = self._write_back(before, new)
         new = without_shared_memory(new, (*state[:-1], *state.statistics, *measurement))
         return new if levels is None or surfaces is None else (new, surfaces)
 
@@ -362,7 +339,7 @@ class ElevationMap(RestartableMap):
         """
         from torchelev.diagnosis.causes import diagnose  # updates do not need it
 
-        return diagnose(self.cfg, self.measured_state, self._history)
+        return diagnose(self.cfg, self.state, self._history)
 
     def _forget_derived(self) -> None:
         super()._forget_derived()

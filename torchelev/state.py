@@ -47,7 +47,7 @@ class MapState(NamedTuple):
     elevation: Float[Tensor, "B H W"]  #: [m] map frame
     variance: Float[Tensor, "B H W"]  #: [m^2]
     validity: Bool[Tensor, "B H W"]  #: elevation is known
-    support: Float[Tensor, "B H W"]  #: points that agree, less points that disagree; -1 of a prediction
+    support: Float[Tensor, "B H W"]  #: points that agree, less points that disagree
     challenger: Float[Tensor, "B H W"]  #: [m] lowest height that contradicts the elevation from above; no gradient
     challenger_support: UInt8[Tensor, "B H W"]  #: points that do so, less points that do not
     time: Float[Tensor, "B H W"]  #: [s] since the last hit; of unknown cells it stands still

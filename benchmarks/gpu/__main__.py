@@ -22,7 +22,7 @@ import torch
 from benchmarks import RESULTS
 from benchmarks.gpu.agreement import correctness, host_never_waits
 from benchmarks.gpu.report import verdicts
-from benchmarks.gpu.timing import Figure, completion, many_robots, one_robot
+from benchmarks.gpu.timing import Figure, many_robots, one_robot
 from benchmarks.speed.workload import Drive, full_config
 from torchelev.app.results import markdown_table, slug, write_json
 
@@ -35,7 +35,7 @@ def _agreement(device: str, seconds: float) -> Iterator[Figure]:
         yield name, partial(host_never_waits, drive)
 
 
-PARTS = {"agreement": _agreement, "one": one_robot, "many": many_robots, "completion": completion}
+PARTS = {"agreement": _agreement, "one": one_robot, "many": many_robots}
 
 
 def main() -> int:

@@ -11,9 +11,6 @@ _CASES = {
     "update: one robot, 43,074 points, 250 x 250 cells": "one robot",
     "update: 4096 robots, 3072 points each, 64 x 64 cells": "many robots",
     "height scans: 4096 robots, 187 points each": "height scans",
-    "completion: one map, 250 x 250 cells": "completion, 250 x 250",
-    "completion: 256 maps, 64 x 64 cells": "completion, 256 x 64 x 64",
-    "completion: 4096 maps, 64 x 64 cells": "completion, 4096 x 64 x 64",
 }
 # How a case may be run: the endings of the names of its figures.
 _UNCOMPILED, _COMPILED, _CAPTURED = (", eager", ""), (", compiled", ", update"), (", captured",)

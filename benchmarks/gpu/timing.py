@@ -11,13 +11,9 @@ from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 
 from benchmarks.speed import meter
-from benchmarks.speed.completion import make_maps
 from benchmarks.speed.workload import BPEARL, Drive, full_config
-from torchelev import CompletionNet
-from torchelev.completion.complete import CompletionInput
 
 _SCAN_POINTS = 187  # of a height scan
-MAPS = {"250 x 250": (1, 250), "256 x 64 x 64": (256, 64), "4096 x 64 x 64": (4096, 64)}  # completed: maps, cells
 Figure = tuple[str, Callable[[], Any]]  # its name and the call that measures it
 
 
@@ -99,20 +95,6 @@ def many_robots(device: str, seconds: float) -> Iterator[Figure]:
             yield "height scans, captured", lambda: _time_captured(lambda: sample(emap.state, xy), seconds)
         yield "many robots, captured", lambda: meter.milliseconds(_captured(drive), seconds)
     yield "reset", lambda: meter.milliseconds(emap.reset, seconds)
-
-
-def completion(device: str, seconds: float) -> Iterator[Figure]:
-    """Time the completion of maps half of whose cells are unknown: eager, compiled, captured."""
-    sizes = {"4 x 64 x 64": (4, 64)} if device == "cpu" else MAPS
-    net = CompletionNet.from_pretrained().requires_grad_(False).to(device)
-    for name, size in sizes.items():
-        layers = CompletionInput(*(layer.to(device) for layer in make_maps(*size)))
-        compiled = torch.compile(net)
-        for kind, complete in (("eager", net), ("compiled", compiled)):
-            run = partial(complete, *layers, resolution=0.04)
-            yield f"completion, {name}, {kind}", partial(meter.milliseconds, run, seconds)
-        if device != "cpu":
-            yield f"completion, {name}, captured", partial(_time_captured, run, seconds)
 
 
 def _time_captured(run: Callable[[], Any], seconds: float) -> dict[str, float]:

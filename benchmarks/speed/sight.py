@@ -111,8 +111,7 @@ def measure_scans(robots: int, seconds: float) -> dict[str, Any]:
     cells = _cells_below(HeightScan.isaac_lab(), emap, T)
     runs: dict[str, Callable[[], Any]] = {"gather": lambda: emap.elevation.flatten(1).gather(1, cells)}
     for preset, fill in itertools.product(PRESETS, (*FILLS, ORIGINAL)):
-        if fill != "completed":
-            runs[f"{preset}, {fill}"] = partial(HeightScan.preset(preset, fill=fill), emap, T)
+        runs[f"{preset}, {fill}"] = partial(HeightScan.preset(preset, fill=fill), emap, T)
     return interleaved(runs, seconds)
 
 

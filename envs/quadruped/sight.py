@@ -16,7 +16,7 @@ from envs.quadruped.config import SENSORS, QuadrupedConfig
 from envs.quadruped.height_noise import HeightNoise
 from envs.quadruped.kinematics import LINKS
 from envs.quadruped.physics import ROBOT
-from torchelev import CompletionConfig, ElevationMap, ElevationMapConfig, GridConfig, HeightScan, SensorConfig
+from torchelev import ElevationMap, ElevationMapConfig, GridConfig, HeightScan, SensorConfig
 from torchelev.io.robot_model import read_body
 from torchelev.observations.patterns import compute_heading
 from torchelev.sim import DepthCamera, HeightField, Lidar, MountedSensor, SensorErrorConfig, SensorErrors, mount, preset
@@ -129,8 +129,7 @@ class MapSight(BlindSight):
         grid = GridConfig(resolution=sight.resolution, length_x=sight.window, length_y=sight.window)
         self.body = read_body(ROBOT)
         self.link_ids = [LINKS.index(link) for link in self.body.links]
-        completion = CompletionConfig() if sight.fill == "completed" else None
-        config = ElevationMapConfig(grid=grid, sensor=SensorConfig(body=self.body), completion=completion)
+        config = ElevationMapConfig(grid=grid, sensor=SensorConfig(body=self.body))
         self.emap = ElevationMap(config, num_envs, device)
         if compiled:
             self.emap.compile()

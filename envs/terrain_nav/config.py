@@ -61,7 +61,7 @@ class SightConfig:
     pose_errors: str = "leg_odometry"  #: preset of torchelev.sim
     truth_noise: float = 0.1  #: [m] amplitude of the uniform noise on the heights of perception "truth"
     #: what the elevation of perception "map" reads where the map is unknown, by the rules of `HeightScan`: "base" for
-    #: the nominal ground below the base, "inpaint", "completed", ...; the validity always marks unknown cells
+    #: the nominal ground below the base, "inpaint", ...; the validity always marks unknown cells
     fill: str = "base"
     #: what the image shows of ceilings, after its four layers: "none"; "scan", a height scan of the ceiling and its
     #: mask; "drop", the same as heights below `no_ceiling`; "voxels", what a `VoxelCrop` finds occupied. All but "none"

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from envs.terrain_nav.ceilings import count_channels, make_reader
 from envs.terrain_nav.config import TerrainNavConfig
 from envs.terrain_nav.course import RatedCourse
-from torchelev import CompletionConfig, ElevationMap, ElevationMapConfig, GridConfig, HeightScan, LevelsConfig, MapImage
+from torchelev import ElevationMap, ElevationMapConfig, GridConfig, HeightScan, LevelsConfig, MapImage
 from torchelev.errors import require
 from torchelev.sim import DepthCamera, MountedSensor, PoseErrors, SensorErrors, mount_on_rim, preset
 from torchelev.sim.terrains.heightfield import heights_of
@@ -143,10 +143,9 @@ class MapSight(BlindSight):
         super().__init__(cfg, course, num_envs)
         sight, device = cfg.sight, course.field.device
         grid = GridConfig(resolution=sight.resolution, length_x=sight.window, length_y=sight.window)
-        completion = CompletionConfig() if sight.fill == "completed" else None
         # Half the height of the robot: the map then tells spaces that it does not fit into from walls.
         levels = LevelsConfig(min_gap=cfg.robot.top / 2) if sight.ceilings != "none" else None
-        map_cfg = ElevationMapConfig(grid=grid, completion=completion, levels=levels)
+        map_cfg = ElevationMapConfig(grid=grid, levels=levels)
         self.emap = ElevationMap(map_cfg, num_envs, device)
         self.read_ceilings = make_reader(cfg, self.crop)
         self.filled_scan = _make_filled_scan(cfg, self.crop)

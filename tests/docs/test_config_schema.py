@@ -7,7 +7,6 @@ import pytest
 
 from docs.config_schema import FILE, schema
 from torchelev import BodyConfig, Capsule, ElevationMapConfig, RobotBody, SensorConfig, TraversabilityConfig
-from torchelev.completion.config import CompletionConfig
 from torchelev.filters.chain import FilterConfig
 
 CONFIGS = {
@@ -16,7 +15,6 @@ CONFIGS = {
     "box": ElevationMapConfig(sensor=SensorConfig(body=BodyConfig(), exclusion=None)),
     "infinite": ElevationMapConfig(traversability=TraversabilityConfig(critical_slope=float("inf"))),
     "python": ElevationMapConfig(
-        completion=CompletionConfig(),
         filters=(FilterConfig(layer="smooth", filter="gaussian", settings={"sigma": 0.1}),),
         sensor=SensorConfig(
             body=RobotBody(capsules=[Capsule(link="leg", start=(0, 0, 0), end=(0, 0, -0.4), radius=0.1)])
@@ -47,7 +45,7 @@ def test_saved_configs_fit(tmp_path, name):
         {"fusion": None},
         {"sensor": {"body": {"capsules": [{"link": "leg"}]}}},
         {"filters": [{"layer": "smooth"}]},
-        {"completion": {"when": "never"}},
+        {"completion": {"when": "read"}},
     ],
 )
 def test_what_is_refused_does_not_fit(values):

@@ -12,7 +12,6 @@ from tests.docs.markdown import DOCS
 from torchelev.filters import FILTERS
 from torchelev.layers import LAYERS
 from torchelev.levels import LAYERS as LEVEL_LAYERS
-from torchelev.stages.complete import COMPLETED
 
 REFERENCE = DOCS / "reference"
 TABLES = re.findall(
@@ -40,7 +39,7 @@ def test_a_table_says_a_sentence_about_every_field(name, body):
 
 def test_every_layer_has_a_row():
     rows = re.findall(r"^\| (`.*?`) \|", (REFERENCE / "layers.md").read_text(), re.MULTILINE)
-    assert re.findall(r"`(\w+)`", " ".join(rows)) == [*LAYERS, *COMPLETED, *LEVEL_LAYERS]
+    assert re.findall(r"`(\w+)`", " ".join(rows)) == [*LAYERS, *LEVEL_LAYERS]
 
 
 def test_every_filter_is_shown_once_with_its_picture():

@@ -136,17 +136,6 @@ def test_a_fill_changes_the_elevation_of_unknown_pixels_alone(fill):
 
 
 @pytest.mark.slow(1)
-def test_completed_pixels_are_those_of_the_completed_map():
-    task = TerrainNav(TerrainNavConfig(course=SMALL, sight=SightConfig(fill="completed")), 2)
-    task.advance(torch.ones(2, 2))
-    task.sense()
-    sight, image = task.sight, task.observe()["map"]
-    completed = dataclasses.replace(sight.crop, layers=("completed",))(sight.emap, sight.T_estimated)[:, 0]
-    unknown = image[:, 2] == 0
-    torch.testing.assert_close(image[:, 0][unknown], completed[unknown], atol=1e-6, rtol=0)
-
-
-@pytest.mark.slow(1)
 def test_each_camera_sees_from_its_own_mounting():
     """Cast together, the cameras see what each would see alone."""
     cfg = TerrainNavConfig(course=SMALL, sight=SightConfig(sensor_errors="perfect", pose_errors="perfect"))

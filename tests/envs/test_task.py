@@ -110,7 +110,7 @@ def test_wrong_arguments_are_refused():
         TerrainNavConfig(dt=0.0)
     with pytest.raises(ValueError, match="sight.window: must hold the crop at any heading"):
         SightConfig(crop_length=5.0)
-    with pytest.raises(ValueError, match="sight.fill: must be one of ground, base, .*completed, got 'zero'; use base"):
+    with pytest.raises(ValueError, match="sight.fill: must be one of ground, base, .*inpaint, got 'zero'; use base"):
         SightConfig(fill="zero")
 
 

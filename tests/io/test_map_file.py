@@ -238,6 +238,18 @@ def test_reads_a_file_of_version_2_without_the_younger_fields(path):
     assert differences(others, whole.state) == ["pose_covariance", "elapsed"]
 
 
+def test_reads_a_file_of_before_without_its_predictions(path):
+    before = load_map(path).state
+    predicted = before.validity & (torch.rand(before.validity.shape, generator=torch.Generator().manual_seed(0)) < 0.5)
+    config = json.loads(str(np.load(path)["header"]))["config"]
+    rewrite(path, support=torch.where(predicted, -1.0, before.support).numpy())
+    rewrite_header(path, config={**config, "completion": {"weights": None, "when": "read", "write_back": True}})
+    state = load_map(path).state
+    assert predicted.any() and torch.equal(state.validity, before.validity & ~predicted)
+    assert torch.equal(state.elevation[state.validity], before.elevation[state.validity])
+    assert (state.support >= 0).all() and not state.elevation[predicted].any()
+
+
 @pytest.mark.parametrize("env_ids", [[2], [-1], [], [[0]], [0.0], torch.tensor([True, False])])
 def test_refuses_environments_that_do_not_exist(path, env_ids):
     with pytest.raises(ValueError, match="env_ids"):

@@ -76,7 +76,6 @@ def loop_scan(scan, emap, T, feet, b):
     h, known = layers["elevation"], layers["validity"]
     bound = np.where(known, h, layers["upper_bound"])
     filled = loop_inpaint(h, known, scan.inpaint_rings)
-    completed = [part[b].numpy() for part in emap.read_layer("completed")]
     places = []
     for middle in [T[b, :3, 3]] if feet is None else feet[b]:
         for point in scan.pattern:
@@ -96,8 +95,6 @@ def loop_scan(scan, emap, T, feet, b):
             ground, good = (0.0, False) if value is None else (value, True)
         if not good and scan.fill == "inpaint":
             ground, good = loop_sample(*filled, x, y, corner, scan.mode)
-        if not good and scan.fill == "completed":
-            ground, good = loop_sample(*completed, x, y, corner, scan.mode)
         value = z - ground - scan.nominal_height if good else 0.2 if isinstance(scan.fill, str) else scan.fill
         values.append(value if scan.clip is None else min(max(value, -scan.clip), scan.clip))
     return np.array(values) * scan.scale, np.array([good for _, good in read])

@@ -5,7 +5,7 @@ import pytest
 import torch
 from hypothesis import strategies as st
 
-from tests.helpers import pose, random_state, small_map, with_completion
+from tests.helpers import pose, random_state, small_map
 
 SEEDS = st.integers(0, 10_000)
 BASE = (0.3, -0.2, 0.7)
@@ -14,7 +14,7 @@ CORNER = (-12, -17)  # the window's, 30 x 30 cells of 0.1 m, around the base
 
 def ground_map(height, num_envs=1, corner=CORNER, cells=(30, 30), dtype=torch.float64, **layers):
     """A map of 0.1 m cells that knows `height(x, y)` [m] everywhere, with its corner at these cell numbers."""
-    emap = small_map(num_envs, cells, dtype=dtype, **with_completion())
+    emap = small_map(num_envs, cells, dtype=dtype)
     emap.corner.copy_(torch.tensor(corner))
     x, y = emap.cell_centers().unbind(-1)
     emap.elevation.copy_(height(x, y))
@@ -45,7 +45,7 @@ def at(values, *index):
 def random_map(seed, num_envs=2, known=0.6, cells=(20, 18), dtype=torch.float64):
     """Holes larger than a cell, too; unknown cells hold NaN."""
     rng = np.random.default_rng(seed)
-    emap = small_map(num_envs, cells, dtype=dtype, **with_completion())
+    emap = small_map(num_envs, cells, dtype=dtype)
     state = random_state(rng, emap.cfg.grid, num_envs, known, dtype)
     validity = state.validity & ~torch.nn.functional.max_pool2d((state.time < 0.03).float(), 5, 1, 2).bool()
     bounded = state.bounded & (state.support < 12)

@@ -8,12 +8,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.helpers import pose, small_map
+from tests.helpers import pose
 from tests.observations.loops import loop_inpaint
 from tests.observations.maps import BASE, SEEDS, at, flat, ground_map, near, random_map
 from torchelev.observations.fill import inpaint
 from torchelev.observations.height_scan import HeightScan
-from torchelev.observations.presets import PRESETS
 
 
 @pytest.mark.parametrize(
@@ -52,7 +51,6 @@ def test_fills_by_hand():
         "lowest": (0.195,) * 3,
         "upper_bound": (-0.05, 0.0, 0.0),
         "inpaint": (0.195, 0.195, 0.0),
-        "completed": (0.2 - emap.layer("completed")[0, [15, 16, 21], 17]).tolist(),
         -0.3: (-0.3, -0.3, -0.3),
     }
     for fill, unknown in expected.items():
@@ -60,37 +58,6 @@ def test_fills_by_hand():
         values, valid = scan(emap, pose(BASE))
         assert valid.tolist() == [[True, False, False, False]]
         assert at(values, 0, 1, 2, 3) == near(0.195, *unknown)
-
-
-@pytest.mark.parametrize("name", PRESETS)
-def test_a_completed_scan_reads_flat_ground_where_nothing_is_known(name):
-    emap, T = ground_map(flat, 2), pose(BASE, num_envs=2)
-    emap.validity[0] = False
-    emap.validity[1, 10:20] = False
-    scan = HeightScan.preset(name, fill="completed", standing_height=0.6)
-    (values, valid), (base, _) = scan(emap, T), dataclasses.replace(scan, fill="base")(emap, T)
-    assert torch.equal(values[0], base[0]) and not valid[0].any()
-    assert torch.equal(values[1][valid[1]], base[1][valid[1]]) and 0 < valid[1].sum() < 187
-    assert not torch.equal(values[1], base[1])
-    original = dataclasses.replace(scan, fill="original", original="completed")
-    assert torch.equal(original(emap, T)[0], values)
-
-
-def test_a_completed_scan_needs_a_map_with_completion():
-    with pytest.raises(ValueError, match="fill: needs maps with completion, .*give ElevationMapConfig a Completion"):
-        HeightScan.isaac_lab(fill="completed")(small_map(1, (30, 30)), pose())
-
-
-def test_a_completed_scan_reads_what_the_map_keeps():
-    emap, _ = random_map(2)
-    kept = emap.layer("completed")
-    for weights in emap.completion_net.parameters():
-        weights.fill_(torch.nan)  # what is computed again is NaN
-    T = pose((0.0, 0.0, 0.5), num_envs=2)
-    T[:, :3, 3] = emap.center
-    scan = HeightScan.points([(0.05, 0.05)], mode="nearest", fill="completed")
-    emap.validity[:] = False
-    torch.testing.assert_close(scan(emap, T)[0], T[:, 2:3, 3] - kept[:, 10:11, 9])
 
 
 def test_inpainting_fills_a_ring_at_a_time():

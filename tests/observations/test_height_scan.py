@@ -23,9 +23,6 @@ from torchelev.observations.map_image import MapImage
 from torchelev.observations.patterns import ALIGNMENTS
 from torchelev.observations.presets import PRESETS
 
-# Completion computes in part in float32, and on a CPU its work depends on the data; see test_gpu and tests/completion.
-PLAIN_FILLS = [fill for fill in FILLS if fill != "completed"]
-
 # The presets, worked out by hand: the base at (0.3, -0.2, 0.7) looks along +y, so that the pattern's point (x, y) lies
 # at (0.3 - y, -0.2 + x). Ground 0.1 x + 0.2 y:
 #   (-0.8, -0.5) -> (0.8, -1.0): -0.12    (-0.7, -0.5) -> (0.8, -0.9): -0.10
@@ -231,7 +228,7 @@ def turned(T, position, angle):
 
 @pytest.mark.slow(1)
 @pytest.mark.parametrize("alignment", ALIGNMENTS)
-@pytest.mark.parametrize("fill", PLAIN_FILLS)
+@pytest.mark.parametrize("fill", FILLS)
 def test_gradcheck_of_map_and_pose(alignment, fill):
     emap, rng = random_map(8)
     T, state = random_base(emap, rng), emap.state
@@ -290,7 +287,7 @@ def test_nothing_waits_for_the_device():
     with FakeTensorMode():
         emap, T = ElevationMap(num_envs=2), torch.zeros(2, 4, 4, dtype=torch.float64)
         for mode in MODES:
-            for fill in (*PLAIN_FILLS, 0.5):
+            for fill in (*FILLS, 0.5):
                 scan = HeightScan.grid(mode=mode, fill=fill, noise=0.1, clip=1.0)
                 assert scan(emap, T, noise=True)[0].shape == (2, 187)
             for alignment in ALIGNMENTS:

@@ -21,7 +21,7 @@ from torchelev.state import map_layers
 HAS_CPP = find_compiler() is not None and not is_switched_off()
 needs_cpp = pytest.mark.skipif(not HAS_CPP, reason="needs a C++ compiler")
 SIZES = st.sampled_from([(22, 21), (64, 40), (90, 71)])
-FAST_FILLS = [*(fill for fill in FILLS if fill != "completed"), ORIGINAL, 0.35]
+FAST_FILLS = [*FILLS, ORIGINAL, 0.35]
 
 
 def require_same(monkeypatch, scan, *arguments, noise=False):
@@ -107,7 +107,7 @@ def test_cpp_reads_float32_without_gradients():
         in_state(inputs, upper_bound=heights),
         in_state(inputs, validity=few),  # which tensors refuse
     ]
-    assert not can_read("completed", inputs) and not any(can_read("ground", other) for other in others)
+    assert not any(can_read("ground", other) for other in others)
     with torch.no_grad():
         assert can_read("ground", in_state(inputs, elevation=heights)._replace(T_map_base=T))
 

@@ -10,7 +10,8 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 
 from benchmarks.quality.occlusion.refine import piece_costs, refine
 from benchmarks.quality.occlusion.rules import decide
-from benchmarks.quality.occlusion.scenes import VIEWS, abyss, cliff, hump, step_down, views
+from benchmarks.quality.occlusion.scenes import abyss, cliff, hump, step_down
+from benchmarks.quality.occlusion.walks import VIEWS, views
 from tests.devices import NoConstants, OneDevice, unread
 from tests.planning.maps import CORNER, NO_LIMITS, RESOLUTION, ground_map, place, random_map
 from tests.planning.test_cost_to_go import dijkstra
@@ -258,14 +259,14 @@ def test_the_upper_bound_tells_a_safe_occlusion_from_a_drop(make, goes):
     assert sorted(seen, reverse=True) == list(VIEWS)
     for view in (1.2, 0.8):
         emap, x = seen[view]
-        assert decide(emap, x, case.goal)["upper bound"].reached.item() == goes == case.safe
+        assert decide(emap, x, case)["upper bound"].reached.item() == goes == case.safe
 
 
 @pytest.mark.slow(1)
 def test_a_cautious_planner_stops_before_what_it_does_not_see():
     case = hump([0.6, 0.4])
     emap, x = views(case, torch.Generator().manual_seed(1))[2.0]
-    ways = decide(emap, x, case.goal)
+    ways = decide(emap, x, case)
     assert ways["upper bound"].reached and not ways["unknown is impassable"].reached
 
 

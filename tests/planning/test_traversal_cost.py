@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from tests.devices import NoConstants, OneDevice
-from tests.helpers import random_state, small_map, with_completion
+from tests.helpers import random_state
 from tests.planning.maps import NO_LIMITS, RESOLUTION, ground_map, random_map
 from torchelev import ElevationMap, ElevationMapConfig
 from torchelev.planning.traversal_cost import TraversalCostConfig, cost_of_layers, traversal_cost
@@ -78,22 +78,6 @@ def test_unknown_ground_without_a_bound_is_impassable():
     emap.bounded[0, 8] = False
     cost = traversal_cost(emap)[0]
     assert cost[8].isinf().all() and cost[7].isfinite().all()
-
-
-def test_unknown_ground_may_be_inclined_as_completed():
-    """It may then be passable where the bound is steep, or where there is none."""
-    cfg = TraversalCostConfig(unknown_layer="completed")
-    emap = occluded(lambda x: -0.56 * x)
-    emap.bounded[0, 8] = False
-    completing = small_map(1, (16, 14), dtype=emap.elevation.dtype, **with_completion())
-    completing.load_state(emap.state)
-    rated, ground = (completing.read_layer(name) for name in ("traversability", "completed"))
-    expected = cost_of_layers(rated, ground, 0.1, TraversalCostConfig())
-    cost = traversal_cost(completing, cfg)
-    assert torch.equal(cost, expected) and torch.equal(traversal_cost(completing, cfg, state=completing.state), cost)
-    assert not torch.equal(cost, traversal_cost(completing)) and traversal_cost(completing)[0, 8].isinf().all()
-    with pytest.raises(KeyError, match="'completed'; give the config a CompletionConfig"):
-        traversal_cost(emap, cfg)
 
 
 def test_nothing_known():
@@ -249,7 +233,6 @@ def test_nothing_waits_for_the_device():
     ({"weight_traversability": -1.0}, "cost.weight_traversability: must be at least 0"),
     ({"weight_confidence": math.nan}, "cost.weight_confidence: must be at least 0"),
     ({"weight_inclination": INF}, "cost.weight_inclination: must be at least 0"),
-    ({"unknown_layer": "elevation"}, "cost.unknown_layer: must be one of upper_bound, completed, got 'elevation'"),
     ({"stand_radius": "0.4"}, "cost.stand_radius: must be at least 0"),
     ({"max_inclination": 0.0}, "cost.max_inclination: must lie between 0 and pi / 2"),
     ({"max_inclination": 1.6}, "cost.max_inclination: must lie between 0 and pi / 2"),

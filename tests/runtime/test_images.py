@@ -50,7 +50,6 @@ def test_images(maps, name):
         ('{"size": 3}', "image.size: must be one of length_x"),
         ('{"layers": ["height"]}', "image.layers: must be one of elevation"),
         ('{"layers": ["elevation", "elevation"]}', "must name each channel once"),
-        ('{"layers": ["completed"]}', "needs Python"),
         ('{"channels": ["rgb"]}', "image.channels: needs Python"),
         ('{"layers": []}', "image.layers: must be some of"),
         ('{"length_x": 1.63}', "length_x: must be a whole number of times 0.05 m, got 32.6 times; try 1.65"),

@@ -83,7 +83,6 @@ def test_an_empty_map_reads_flat_ground(library):
         ("{}", "layout.pattern: must be one or more points"),
         ('{"pattern": [[1]]}', "layout.pattern: must be one or more points"),
         ('{"pattern": [[0, 0]], "fil": 1}', "layout.fil: must be one of pattern"),
-        ('{"pattern": [[0, 0]], "fill": "completed"}', "needs Python"),
         ('{"pattern": [[0, 0]], "channels": ["rgb"]}', "layout.channels: needs Python"),
         ('{"pattern": [[0, 0]], "fill": "inf"}', "layout.fill: must be finite without a clip"),
         ('{"pattern": [[0, 0]], "mode": "cubic"}', "layout.mode: must be one of"),

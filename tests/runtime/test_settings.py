@@ -179,7 +179,6 @@ def test_bad_settings_are_refused_in_pythons_words(library, tmp_path, values):
 NEEDS_PYTHON = {
     "learned": ElevationMapConfig(traversability=LearnedTraversabilityConfig()).to_dict(),
     "learned, in short": {"traversability": {"robot": {"length": 0.5}}},
-    "completion": {"completion": {}},
     "filters": {"filters": [{"layer": "slope", "filter": "slope"}]},
 }
 

@@ -60,7 +60,7 @@ def test_a_smoke_run_takes_small_values_where_none_is_given(arguments, expected)
     assert CliRunner().invoke(training, arguments).output.strip() == expected
 
 
-@pytest.mark.parametrize("name", ["nav", "quadruped", "traversability", "completion"])
+@pytest.mark.parametrize("name", ["nav", "quadruped", "traversability"])
 def test_every_training_has_small_values_of_its_own_options(name):
     pytest.importorskip("rsl_rl")
     command = importlib.import_module(f"training.{name}.train").main

@@ -6,8 +6,6 @@ import shutil
 
 from torchelev.channels.native import LIBRARY as CHANNELS
 from torchelev.channels.views import LIBRARY as VIEWS
-from torchelev.completion.completion_kernel import library_of
-from torchelev.completion.net import CompletionNet
 from torchelev.config import ElevationMapConfig
 from torchelev.kernels.cpu_build import AHEAD, build_ahead
 from torchelev.kernels.cpu_update import compiled_stages
@@ -31,9 +29,8 @@ def main() -> None:
     """Build all libraries for each instruction set of this machine's kind."""
     shutil.rmtree(AHEAD, ignore_errors=True)
     stages = compiled_stages(register_stages(ElevationMapConfig())).parts
-    completion = library_of(CompletionNet.from_pretrained().weights)
     others = (CASTING, CHANNELS, DIJKSTRA, ERRORS, HEIGHTS, IMAGES, LEVELS, OWN_POINTS, SCANS, VIEWS, VOXELS)
-    for library in (stages, completion, *others, library_parts()):
+    for library in (stages, *others, library_parts()):
         for path in build_ahead(*library):
             print(path.name)
     for name in ("torchelev.h", "torchelev.hpp"):

@@ -95,7 +95,7 @@ def _load(map_file: Path, robot: dict[str, float]) -> ElevationMap:
     if isinstance(emap.cfg.traversability, LearnedTraversabilityConfig):
         head = replace(emap.cfg.traversability, robot=RobotConfig(**robot))
     cfg = replace(emap.cfg, traversability=head)
-    rated = ElevationMap(cfg, head=emap.head, completion_net=emap.completion_net).to(emap.elevation.dtype)
+    rated = ElevationMap(cfg, head=emap.head).to(emap.elevation.dtype)
     rated.load_state(rate(emap.state, cfg, None if rated.head is None else rated.head.weights))
     if rated.channels is not None and emap.channels is not None:
         rated.channels.load_state_dict(emap.channels.state_dict())

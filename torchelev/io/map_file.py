@@ -13,7 +13,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchelev.completion.net import CompletionNet
 from torchelev.config import ElevationMapConfig
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
@@ -21,7 +20,7 @@ from torchelev.files.output_files import atomic_file
 from torchelev.inputs import checks
 from torchelev.maps.buffers import name_tensors, state_of
 from torchelev.pipeline import rate
-from torchelev.state import MapState
+from torchelev.state import MapState, forget_cells
 from torchelev.traversability.net import TraversabilityNet
 
 FORMAT, VERSION = "torchelev map", 2
@@ -36,8 +35,7 @@ def save_map(path: str | Path, emap: ElevationMap) -> None:
 
     The arrays are `header` (JSON: format, version, dtype, config), each field of `MapState` by its name, each field of
     `Statistics` as `last_<name>`, what channels and levels hold as `channels_<name>` and
-    `levels_<name>`, and the weights of a learned head as
-    `head_<name>`, of a completion network as `completion_net_<name>`. As in the map's state, unknown cells have
+    `levels_<name>`, and the weights of a learned head as `head_<name>`. As in the map's state, unknown cells have
     validity 0, not NaN.
 
     Args:
@@ -55,7 +53,7 @@ def map_arrays(emap: ElevationMap, envs: slice = slice(None)) -> dict[str, Any]:
     """Return the arrays of `save_map` for some environments of a map."""
     dtype = str(emap.elevation.dtype).removeprefix("torch.")
     header = {"format": FORMAT, "version": VERSION, "dtype": dtype, "config": emap.cfg.to_dict()}
-    header |= {name: None if net is None else net.config for name, net in _nets(emap).items()}
+    header["head"] = None if emap.head is None else emap.head.config
     of_environments = {name: value[envs] for name, value in (name_tensors(emap.state) | _followers(emap)).items()}
     arrays = {name: as_array(value) for name, value in (of_environments | _weights(emap)).items()}
     return {"header": np.array(json.dumps(header)), **arrays}
@@ -85,10 +83,10 @@ def load_map(
     header = _header(path, arrays)
     ids = _ids(env_ids, _num_envs(path, arrays))
     try:
-        kinds: dict[str, type] = {"head": TraversabilityNet, "completion_net": CompletionNet}
-        found = {name: kind for name, kind in kinds.items() if header.get(name) is not None}
-        nets = {name: kind(**header[name]).requires_grad_(False) for name, kind in found.items()}
-        emap = ElevationMap(ElevationMapConfig.from_dict(header["config"]), len(ids), device, **nets)
+        predicts = header["config"].pop("completion", None) is not None  # a stage of older versions
+        sizes = header.get("head")
+        head = None if sizes is None else TraversabilityNet(**sizes).requires_grad_(False)
+        emap = ElevationMap(ElevationMapConfig.from_dict(header["config"]), len(ids), device, head=head)
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise ValueError(f"{path}: {error}; a filter of your own must be registered before it is loaded") from error
     emap = emap.to(_DTYPES[header["dtype"]])
@@ -97,6 +95,8 @@ def load_map(
     state = _state(path, arrays, emap.state, ids, header["version"])
     if header["version"] < VERSION:
         state = rate(state, emap.cfg, None if emap.head is None else emap.head.weights)
+    if predicts:  # such files mark the cells that were filled by their support
+        state = forget_cells(state, state.validity & (state.support < 0))
     emap.load_state(state)
     B = len(arrays["corner"])
     for name, value in _followers(emap).items():
@@ -104,15 +104,10 @@ def load_map(
     return emap
 
 
-def _nets(emap: ElevationMap) -> dict[str, TraversabilityNet | CompletionNet | None]:
-    """Return the map's networks by name; None for those that it lacks."""
-    return {"head": emap.head, "completion_net": emap.completion_net}
-
-
 def _weights(emap: ElevationMap) -> dict[str, Tensor]:
-    """Return the weights of the map's networks by the names of their arrays."""
-    nets = {name: net for name, net in _nets(emap).items() if net is not None}
-    return {f"{name}_{key}": value for name, net in nets.items() for key, value in net.state_dict().items()}
+    """Return the weights of the map's learned head by the names of their arrays."""
+    weights = {} if emap.head is None else emap.head.state_dict()
+    return {f"head_{name}": value for name, value in weights.items()}
 
 
 def _followers(emap: ElevationMap) -> dict[str, Tensor]:

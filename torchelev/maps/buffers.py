@@ -116,7 +116,7 @@ class MapBuffers(nn.Module):
         """Load a checkpoint, or refuse one of another config before anything changes, naming the settings."""
         extra = state_dict.get(f"{prefix}_extra_state")
         # Filters hold no state, and weights come from this checkpoint whatever file they were read from.
-        ignored = ("filters", "traversability.weights", "completion.weights", "completion.when")
+        ignored = ("filters", "traversability.weights")
         fields = differing_fields(self.cfg.to_dict(), extra["config"]) if extra else []
         fields = [name for name in fields if not name.startswith(ignored)]
         hint = "build the map with ElevationMapConfig.from_dict(checkpoint['_extra_state']['config'])"

@@ -19,13 +19,6 @@ from torchelev.levels.functional import require_levels
 from torchelev.levels.module import MapLevels
 from torchelev.levels.state import Levels
 from torchelev.maps.buffers import MapBuffers
-from torchelev.stages.complete import (
-    COMPLETED,
-    completed_layers,
-    forget_completed,
-    make_completion_net,
-    write_back,
-)
 from torchelev.stages.disagreement.stage import without_disagreement
 from torchelev.stages.surface.stage import rate_surface
 from torchelev.stages.surface.upper_bound import require_filter
@@ -36,7 +29,6 @@ from torchelev.traversability.rating import Rating
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-    from torchelev.completion.net import CompletionNet
     from torchelev.filters.chain import FilterChain
     from torchelev.traversability.net import TraversabilityNet
     from torchelev.traversability.weight_file import Weights
@@ -50,7 +42,6 @@ class ReadableMap(MapBuffers):
         num_envs: number of maps, B.
         device: device of the maps.
         head: trained head in place of the one that the config names.
-        completion_net: trained network in place of the one that the config names.
     """
 
     def __init__(
@@ -59,24 +50,21 @@ class ReadableMap(MapBuffers):
         num_envs: int,
         device: torch.device | str,
         head: TraversabilityNet | None,
-        completion_net: CompletionNet | None,
     ) -> None:
         super().__init__(cfg, num_envs, device)
         with torch.inference_mode(False):  # inference tensors could not be trained or written outside of that mode
             require_filter(cfg.surface)
             self.head = make_head(cfg.traversability, cfg.grid, head)
-            self.completion_net = make_completion_net(cfg.completion, completion_net)
             self.channels = None
             if cfg.channels:
                 self.channels = Channels(cfg.channels, cfg.grid, cfg.sensor, num_envs, device)
             self.levels = None
             if cfg.levels is not None and cfg.levels.others:
                 self.levels = MapLevels(cfg, num_envs, device)
-        for net in (self.head, self.completion_net):
-            if net is not None:
-                net.to(device)
+        if self.head is not None:
+            self.head.to(device)
         self.filters = self._make_filters()
-        self._derived: dict[str, Layer] = {}  # layers that completion and filters made of the current state
+        self._derived: dict[str, Layer] = {}  # layers that filters made of the current state
 
     def _make_filters(self) -> FilterChain | None:
         """Return the filters that the config asks for."""
@@ -94,31 +82,15 @@ class ReadableMap(MapBuffers):
         return None if self.head is None else self.head.weights
 
     @property
-    def _writes_back(self) -> bool:
-        """Whether completion fills unknown cells of the map."""
-        return self.cfg.completion is not None and self.cfg.completion.write_back
-
-    @property
-    def measured_state(self) -> MapState:
-        """The state without cells that completion filled, of `CompletionConfig(write_back=True)`."""
-        return forget_completed(self.state) if self._writes_back else self.state
-
-    def _write_back(self, before: MapState, state: MapState) -> MapState:
-        """Return a state after an update with its unknown cells filled by completion."""
-        assert self.completion_net is not None and self.cfg.completion is not None
-        weights, max_std = self.completion_net.weights, self.cfg.completion.max_std
-        return write_back(before, state, self.cfg.grid, weights, max_std)
-
-    @property
     def layers(self) -> tuple[str, ...]:
-        """Names of all layers: the map's, those of a configured completion, then those of the configured filters."""
+        """Names of all layers: the map's, then those of the configured filters."""
         return (*self._own_layers, *(step.layer for step in self.cfg.filters))
 
     @property
     def _own_layers(self) -> tuple[str, ...]:
         channels = () if self.channels is None else self.channels.layers
         levels = () if self.levels is None else LEVEL_LAYERS
-        return (*LAYERS, *(() if self.completion_net is None else COMPLETED), *levels, *channels)
+        return (*LAYERS, *levels, *channels)
 
     def layer(
         self, name: str, *, state: MapState | None = None, level: int | None = None, levels: Levels | None = None
@@ -131,10 +103,6 @@ class ReadableMap(MapBuffers):
           not exceed.
         - traversability, 0 (impassable) to 1, and normal_x, normal_y, normal_z of unit length: also unknown where the
           known neighbours do not span a plane. The learned head rates every known cell.
-        - completed and completed_std [m], with a `CompletionConfig`: the ground as a network predicts it, and the
-          standard deviation of that. Known in the whole window of an environment that knows any elevation, unknown in
-          the others. Computed once, and kept until the map changes; with `state`, each time, and differentiable in the
-          state and in the weights of `completion_net`.
         - a channel's, or `<channel>.<component>` of one with several, such as "rgb.red". The channel of several
           components itself is (B, C, H, W). Unknown where no point, and no image, said anything of the ground.
         - ceiling [m], with `LevelsConfig`: the underside of the lowest surface above the ground, inf where rays met
@@ -247,8 +215,6 @@ class ReadableMap(MapBuffers):
         """Return a layer that no filter makes."""
         hint = self._hint_of(name)
         require(name in self._own_layers, "layer", "must be a layer's name", repr(name), hint, KeyError)
-        if name in COMPLETED:
-            return self._complete(state)[name]
         if name in LEVEL_LAYERS:
             assert self.cfg.levels is not None
             return getattr(views, name)(self._surfaces(state, levels), self.cfg.levels.min_gap)  # type: ignore[no-any-return]
@@ -260,21 +226,9 @@ class ReadableMap(MapBuffers):
 
     def _hint_of(self, name: str) -> str:
         """Return what to do about a layer that is not there."""
-        if name in COMPLETED:
-            return "give the config a CompletionConfig"
         if name in LEVEL_LAYERS:
             return LEVEL_HINT
         return f"there are {', '.join(self.layers)}"
-
-    def _complete(self, state: MapState | None = None) -> dict[str, Layer]:
-        """Return the completed layers of a state; those of the map's own state are kept until it changes."""
-        assert self.completion_net is not None
-        if state is not None:
-            return completed_layers(state, self.cfg.grid, self.completion_net.weights)
-        if COMPLETED[0] not in self._derived:
-            with torch.inference_mode(False), torch.no_grad():
-                self._derived |= completed_layers(self.state, self.cfg.grid, self.completion_net.weights)
-        return self._derived
 
     def rate(self, *, state: MapState | None = None) -> Rating:
         """Return traversability and its confidence, (B, H, W) each, 0 to 1.

@@ -107,7 +107,7 @@ class RestartableMap(PaintedMap, ReadableMap):
         """Change the heights besides updates, and rate the map anew."""
         self._derived.clear()
         with torch.no_grad():
-            state = change(subtract_disagreement(self.measured_state))
+            state = change(subtract_disagreement(self.state))
             write(self.state, rate(add_disagreement(state), self.cfg, self._weights))
         self._sync_channels()
 

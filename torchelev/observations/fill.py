@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
 MODES = ("bilinear", "nearest", "minimum")
-FILLS = ("ground", "base", "lowest", "upper_bound", "inpaint", "completed")
+FILLS = ("ground", "base", "lowest", "upper_bound", "inpaint")
 ORIGINAL = "original"
 
 
@@ -91,15 +91,9 @@ def filled_layers(
         state: the state to read; None: that of the maps.
         half_extent: as in `Query`.
         rings: how far "inpaint" reaches [cells].
-
-    Raises:
-        ValueError: if "completed" is asked of maps without completion.
     """
-    if fill == "completed":
-        hint = "give ElevationMapConfig a CompletionConfig"
-        require(fill in emap.layers, "fill", "needs maps with completion", "'completed' of maps without", hint)
-    if fill in ("upper_bound", "completed"):
-        return [emap.read_layer(str(fill), state)]
+    if fill == "upper_bound":
+        return [emap.read_layer(fill, state)]
     return [inpaint(emap.read_layer("elevation", state), half_extent, rings)] if fill == "inpaint" else []
 
 

@@ -27,11 +27,8 @@ from torchelev.state import MapState
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-CHANNELS = (
-    *("elevation", "validity", "variance", "upper_bound", "traversability", "completed", "completed_std"),
-    "clearance",
-)
-HEIGHTS = ("elevation", "upper_bound", "completed")  # they count from the ground below the base
+CHANNELS = ("elevation", "validity", "variance", "upper_bound", "traversability", "clearance")
+HEIGHTS = ("elevation", "upper_bound")  # they count from the ground below the base
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +41,6 @@ class MapImage:
     Layers:
 
     - "elevation" and "upper_bound" [m], above the ground `nominal_height` below the base
-    - "completed" [m] likewise, and "completed_std" [m]: maps whose config has a `CompletionConfig` predict them
     - "validity", 1 where the elevation is known
     - "variance" [m^2]
     - "traversability", 0 (bad) to 1 (good)
@@ -113,7 +109,7 @@ class MapImage:
 
         Raises:
             ValueError, TypeError: for a wrong shape, dtype or device, or a window too small for the image.
-            KeyError: for layers of maps without completion or levels, or channels that the maps lack.
+            KeyError: for layers of maps without levels, or channels that the maps lack.
         """
         grid = emap.cfg.grid
         self._pattern.require_inside(grid)

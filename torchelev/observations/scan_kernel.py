@@ -37,8 +37,6 @@ class _Scan(ctypes.Structure):
 
 def can_read(fill: str | float, inputs: ScanInputs) -> bool:
     """Return whether `read_in_cpp` takes the inputs: float32 on a CPU, with nothing to differentiate or to trace."""
-    if fill == "completed":
-        return False
     state, grid = inputs.state, inputs.grid
     floats = (state.elevation, state.upper_bound, *(() if inputs.draws is None else (inputs.draws,)))
     cells = (len(inputs.T_map_base), grid.height, grid.width)

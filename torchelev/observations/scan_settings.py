@@ -29,10 +29,9 @@ class ScanSettings:
     - "lowest": the lowest known ground under the points of that environment.
     - "upper_bound": the upper bound of the ground from rays that passed over it.
     - "inpaint": means of known neighbours, `inpaint_rings` cells into the unknown area.
-    - "completed": the layer `completed`, which a network predicts; the maps' config needs a `CompletionConfig`.
     - a number [m]: replaces z - elevation - nominal_height.
 
-    Points for which "lowest", "upper_bound", "inpaint" or "completed" have no height read as with "base".
+    Points for which "lowest", "upper_bound" or "inpaint" have no height read as with "base".
 
     `surface="ceiling"` reads what is above instead, on maps with levels:
 

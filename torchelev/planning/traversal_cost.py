@@ -25,8 +25,6 @@ from torchelev.state import MapState
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-UNKNOWN_LAYERS = ("upper_bound", "completed")
-
 
 @dataclass(frozen=True, kw_only=True)
 class TraversalCostConfig:
@@ -40,8 +38,6 @@ class TraversalCostConfig:
     weight_traversability: float = 4.0  #: cost added to a metre of ground rated 0; raise it for longer, safer paths
     weight_confidence: float = 1.0  #: cost added to a metre of unknown ground, or ground rated with confidence 0
     cross_unknown: bool = True  #: False makes all unknown ground impassable
-    #: by which layer unknown ground inclines, "upper_bound" or, of maps with completion, "completed"
-    unknown_layer: str = "upper_bound"
     max_inclination: float = 0.5  #: [rad] unknown ground whose upper bound is steeper counts as a drop: impassable
     inclination_distance: float = 0.3  #: [m] over which the inclination is computed: half the span of the feet
     weight_inclination: float = 1.0  #: cost added to a metre of unknown ground inclined by max_inclination
@@ -59,10 +55,8 @@ class TraversalCostConfig:
     def __post_init__(self) -> None:
         is_bool = isinstance(self.cross_unknown, bool)
         require(is_bool, "cost.cross_unknown", "must be a bool", repr(self.cross_unknown), "give True or False")
-        is_layer, rule = self.unknown_layer in UNKNOWN_LAYERS, f"must be one of {', '.join(UNKNOWN_LAYERS)}"
-        require(is_layer, "cost.unknown_layer", rule, repr(self.unknown_layer), "use upper_bound")
         object.__setattr__(self, "class_costs", parse_costs(self.class_costs))
-        for name in (each.name for each in fields(self) if each.name not in ("unknown_layer", "class_costs")):
+        for name in (each.name for each in fields(self) if each.name != "class_costs"):
             value = getattr(self, name)
             if name == "height":
                 self._require_height(value)
@@ -107,7 +101,7 @@ def traversal_cost(
     Behind an edge, rays that passed over it bound the unseen ground from above. The nearer the robot is, the steeper it
     looks down, and ground that its rays still miss falls away more steeply than they do. So a steep bound indicates a
     drop, and a gentle one ground that may continue (paper, Sec. II-H). From afar a drop looks gentle too: plan again
-    on the way. With `unknown_layer="completed"`, the predicted ground takes the place of the elevation and its bound.
+    on the way.
 
     Args:
         emap: the maps.
@@ -124,8 +118,7 @@ def traversal_cost(
     Raises:
         ValueError, TypeError: for a wrong shape, dtype or device, a map without traversability, or a channel of
             `class_costs` that is not one of classes.
-        KeyError: for `unknown_layer="completed"` of a map without completion, or a channel or class of `class_costs`
-            that the map lacks.
+        KeyError: for a channel or class of `class_costs` that the map lacks.
     """
     cfg = given_or_default(TraversalCostConfig, cfg)
     found = find_obstruction(emap, cfg, state)
@@ -173,7 +166,7 @@ def cost_within(
         shape = tuple(state.elevation.shape)
         fits = tuple(confidence.shape) == shape
         require(fits, "confidence", f"expected {shape}", tuple(confidence.shape), "give one for each cell")
-    rated, bound = (emap.read_layer(name, given) for name in ("traversability", cfg.unknown_layer))
+    rated, bound = (emap.read_layer(name, given) for name in ("traversability", "upper_bound"))
     below = None if standing is None else mark_standing_cells(emap, standing, state)
     beyond = functools.reduce(torch.logical_or, found.exceeded)
     resolution = emap.cfg.grid.resolution
@@ -195,8 +188,7 @@ def cost_of_layers(
 
     Args:
         rated: the traversability, and where it is known.
-        bound: the elevation where it is known, else its upper bound, and where either is known; or the predicted
-            ground.
+        bound: the elevation where it is known, else its upper bound, and where either is known.
         resolution: side of a cell [m].
         cfg: thresholds and weights.
         confidence: confidence of the traversability, 0 to 1; None: 1.

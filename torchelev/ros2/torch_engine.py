@@ -45,7 +45,7 @@ class Diagnosis:
             self._findings, self._running = self._running.result(), None
         if self._running is None and time.monotonic() - self._began >= self.PAUSE:
             self._began = time.monotonic()
-            copies = map_layers(Tensor.clone, emap.measured_state), copy.deepcopy(emap._history)
+            copies = map_layers(Tensor.clone, emap.state), copy.deepcopy(emap._history)
             self._running = self._pool.submit(diagnose, emap.cfg, *copies)
         return self._findings
 

@@ -153,7 +153,7 @@ def _settings(cfg: Any, prefix: str) -> Iterator[str]:
 def _kind(name: str, kinds: list[Any]) -> str:
     if name == "filters":
         return "CHAIN"
-    if name in ("completion", "channels") or any(isinstance(k, type) and issubclass(k, ByTensors) for k in kinds):
+    if name == "channels" or any(isinstance(k, type) and issubclass(k, ByTensors) for k in kinds):
         return "ONLY_PYTHON"
     if name in _CHOICES:
         return "CHOICE"

@@ -236,8 +236,8 @@ class SiteMap(KeyframedSite, RasterSite):
         return drop_reset(contribution, emap.num_resets.to(device), emap.state.elapsed.to(device))
 
     def _bring(self, emap: ElevationMap) -> MapState:
-        """Return a map's state on the site's device, without predictions: a site keeps what was measured."""
-        device, state = self._tiles.device, emap.measured_state
+        """Return a map's state on the site's device."""
+        device, state = self._tiles.device, emap.state
         return state if emap.device == device else map_layers(lambda value: value.to(device), state)
 
     def _plan(self, emap: ElevationMap, time: float | None, align: bool, tilt: bool) -> dict[str, Any]:

@@ -1,10 +1,10 @@
-"""Compare what a policy sees where its map is unknown: the nominal ground, inpainted ground or completed ground.
+"""Compare what a policy sees where its map is unknown: the nominal ground or inpainted ground.
 
     python -m training.nav.fill_experiment
 
 The image has four channels: elevation, upper bound, validity and traversability. Only the elevation of unknown pixels
-differs: "base", the nominal ground below the base, is the usual image of the task; "inpaint" and "completed" are rules
-of `HeightScan`. Every policy sees the validity, and so knows which pixels are filled. A fourth case that shows the
+differs: "base", the nominal ground below the base, is the usual image of the task; "inpaint" is a rule
+of `HeightScan`. Every policy sees the validity, and so knows which pixels are filled. A further case that shows the
 validity alone would be "base" again. Networks, other inputs, seeds and budget are the same.
 
 Trains three seeds with each fill, all with the map in the loop, and deploys every policy with its fill on held-out
@@ -35,10 +35,10 @@ from training.options import jobs_option, runs_option
 from training.runs import mean, spread
 
 # Fixed before the first run.
-FILLS = ("base", "inpaint", "completed")
+FILLS = ("base", "inpaint")
 SEEDS = (0, 1, 2)
 ITERATIONS, NUM_ENVS, EPISODES = 60, 256, 512
-NAMES = {"base": "nominal ground", "inpaint": "inpainted", "completed": "completed"}
+NAMES = {"base": "nominal ground", "inpaint": "inpainted"}
 STEPS = 25  # of the walk over which the error of the filled pixels is averaged
 
 

@@ -27,7 +27,7 @@ from training.quadruped.train import task_config
 from training.runs import mean, spread
 
 # Fixed before the first run.
-FILLS = ("upper_bound", "base", "inpaint", "completed")
+FILLS = ("upper_bound", "base", "inpaint")
 SEEDS, EPISODES = (7, 8, 9), 112  # of starts, bodies and noise; two for each kind, level and seed
 STEPS = 100  # of the walk over which the error of the filled points is averaged
 

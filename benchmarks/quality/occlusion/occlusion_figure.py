@@ -10,7 +10,8 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.image import AxesImage
 
-from benchmarks.quality.occlusion.scenes import GRID, Case
+from benchmarks.quality.occlusion.scenes import Case
+from benchmarks.quality.occlusion.walks import GRID
 from torchelev import ElevationMap
 from torchelev.planning.planner import Path
 from torchelev.planning.traversal_cost import traversal_cost
@@ -19,6 +20,7 @@ from torchelev.viz.style import ROBOT_COLOR, draw_cells, make_figure, save, styl
 _SPAN = (-1.7, 2.6)  # [m] drawn range of x
 EYE = 0.8  # [m] height of the camera
 _RULE = "upper bound"
+_SHOWN = (_RULE, "in-painted by diffusion", "in-painted by the minimum", "unknown is impassable")
 Scene = tuple[Case, ElevationMap, float, dict[str, Path]]  # with the robot's x [m] and the path of each rule
 
 
@@ -51,7 +53,7 @@ def _section(ax: Axes, case: Case, emap: ElevationMap, x: float, plans: dict[str
     ax.plot(x, EYE, "v", color=ROBOT_COLOR, markersize=9, label="camera")
     ax.plot(case.goal, float(case.scene.truth(torch.tensor([case.goal, 0.0]))), "k*", markersize=9, label="goal")
     ax.set(xlim=_SPAN, ylim=(-1.6, 1.0))
-    verdicts = "\n".join(f"{rule}: {'goes' if path.reached[0] else 'stops'}" for rule, path in plans.items())
+    verdicts = "\n".join(f"{rule}: {'goes' if plans[rule].reached[0] else 'stops'}" for rule in _SHOWN)
     ax.set_title(f"{case.kind}: {'safe' if case.safe else 'a drop'}\n{verdicts}", fontsize=9)
 
 

@@ -1,10 +1,12 @@
-"""Four rules for unknown ground, and the plan of each."""
+"""The rules for unknown ground: the plan of each, and the heights that each predicts."""
 
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
-from benchmarks.quality.occlusion.scenes import GRID
+from benchmarks.quality.occlusion.scenes import Case
+from benchmarks.quality.occlusion.walks import GRID
 from torchelev import ElevationMap, filters
 from torchelev.pipeline import rate
 from torchelev.planning.planner import Path, plan
@@ -12,23 +14,42 @@ from torchelev.planning.traversal_cost import TraversalCostConfig
 from torchelev.state import MapState
 
 _IMPASSABLE = TraversalCostConfig(cross_unknown=False)
-RULES = ("upper bound", "in-painted by diffusion", "in-painted by the minimum", "unknown is impassable")
+UPPER_BOUND, TRUTH = "upper bound", "true ground"
+INPAINTED = {
+    "in-painted by diffusion": "inpaint_diffusion",
+    "in-painted by the minimum": "inpaint_minimum",
+    "in-painted by the nearest": "inpaint_nearest",
+    "in-painted by Telea": "inpaint_telea",
+    "in-painted by Navier-Stokes": "inpaint_navier_stokes",
+}
+PREDICTED = (UPPER_BOUND, *INPAINTED)  # rules that predict a height
+RULES = (*PREDICTED, "unknown is impassable", TRUTH)
 
 
-def _inpaint(emap: ElevationMap, filter_name: str) -> MapState:
-    """Return the state with all unknown ground inpainted and rated like measured ground."""
-    layer = (emap.state.elevation, emap.state.validity)
-    elevation, known = filters.Filter(filter_name)(layer, resolution=GRID.resolution)
+def predict(emap: ElevationMap, rule: str) -> tuple[Tensor, Tensor]:
+    """Return the heights (B, H, W) [m] by one of PREDICTED, as measured where known, and where they are known."""
+    state = emap.state
+    if rule == UPPER_BOUND:
+        known = state.validity | state.bounded
+        return torch.where(state.validity, state.elevation, state.upper_bound), known
+    return filters.Filter(INPAINTED[rule])((state.elevation, state.validity), resolution=GRID.resolution)
+
+
+def true_heights(emap: ElevationMap, case: Case) -> Tensor:
+    """Return the true ground (1, H, W) [m] at the map's cells."""
+    return case.scene.truth(emap.cell_centers()[0].double())[None].to(emap.state.elevation.dtype)
+
+
+def decide(emap: ElevationMap, x: float, case: Case) -> dict[str, Path]:
+    """Plan a path by each rule from (x, 0) to the goal behind the edge, with the default settings of the planner."""
+    ends = torch.tensor([[x, 0.0]]), torch.tensor([[case.goal, 0.0]])
+    true = true_heights(emap, case)
+    paths = {UPPER_BOUND: plan(emap, *ends), "unknown is impassable": plan(emap, *ends, _IMPASSABLE)}
+    paths |= {rule: plan(emap, *ends, state=_rated(emap, *predict(emap, rule))) for rule in INPAINTED}
+    paths[TRUTH] = plan(emap, *ends, state=_rated(emap, true, torch.ones_like(true, dtype=torch.bool)))
+    return {rule: paths[rule] for rule in RULES}
+
+
+def _rated(emap: ElevationMap, elevation: Tensor, known: Tensor) -> MapState:
+    """Return the state with this ground, rated like measured ground."""
     return rate(emap.state._replace(elevation=elevation, validity=known), emap.cfg)
-
-
-def decide(emap: ElevationMap, x: float, goal: float) -> dict[str, Path]:
-    """Plan a path by each rule from (x, 0) to (goal, 0) [m]."""
-    ends = torch.tensor([[x, 0.0]]), torch.tensor([[goal, 0.0]])
-    plans = (
-        plan(emap, *ends),
-        plan(emap, *ends, state=_inpaint(emap, "inpaint_diffusion")),
-        plan(emap, *ends, state=_inpaint(emap, "inpaint_minimum")),
-        plan(emap, *ends, _IMPASSABLE),
-    )
-    return dict(zip(RULES, plans, strict=True))

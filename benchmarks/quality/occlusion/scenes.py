@@ -1,4 +1,4 @@
-"""Ground that continues or drops, unseen, behind an edge at x = 0, and the maps of a robot that walks up to it."""
+"""Ground that goes on or ends behind an edge at x = 0 that hides it."""
 
 from __future__ import annotations
 
@@ -9,24 +9,26 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev import ElevationMap, ElevationMapConfig, GridConfig
-from torchelev.sim import Box, DepthCamera, Scene, mount, noisy, walk
+from torchelev.sim import Box, Scene
 from torchelev.sim.exact.scenes import block
 
-GRID = GridConfig(resolution=0.04, length_x=12.0, length_y=4.0)
-CAMERA, T_BASE_CAMERA = DepthCamera(max_range=8.0), mount(pitch_deg=30.0)
-DT, SPEED = 0.2, 0.5  # [s], [m/s]
-FROM, TO = -2.8, -0.6  # [m] of the walk along x
-VIEWS = (2.4, 2.0, 1.6, 1.2, 0.8)  # [m] distances from the edge at which the map is used
+Disturb = Callable[[Tensor, Tensor, torch.Generator], Tensor]  # of points (N, 3) seen from an origin (3,)
+_WIDE = (-9.0, 9.0)  # [m] along y: there is no way around
 
 
 class Case(NamedTuple):
     """A scene whose edge lies at x = 0 and leaves no way around."""
 
     kind: str
-    scene: Scene
+    scene: Scene  #: the true ground
     goal: float  #: [m] x of the goal beyond the edge
-    safe: bool  #: the ground continues
+    safe: bool  #: the ground goes on, in steps that the robot takes
+    edges: tuple[float, ...] = ()  #: [m] x of the risers and edges behind which a foot may land
+    seen: Scene | None = None  #: what the camera sees in place of the ground
+    disturb: Disturb | None = None  #: what becomes of the points that it sees
+
+
+# The ground goes on ---------------------------------------------------------------------------------------------------
 
 
 def hump(u: list[float]) -> Case:
@@ -42,8 +44,8 @@ def hump(u: list[float]) -> Case:
 
 
 def brow(u: list[float]) -> Case:
-    """Return level ground that falls at 12 to 20 degrees by 0.4 to 0.8 m, and is level again."""
-    gradient, fall = math.tan(math.radians(12 + 8 * u[0])), 0.4 + 0.4 * u[1]
+    """Return level ground that falls at 12 to 20 degrees by 0.3 to 0.6 m, and is level again."""
+    gradient, fall = math.tan(math.radians(12 + 8 * u[0])), 0.3 + 0.3 * u[1]
 
     def terrain(x: Tensor, y: Tensor) -> Tensor:
         return -(gradient * x).clamp(0.0, fall)
@@ -52,15 +54,59 @@ def brow(u: list[float]) -> Case:
 
 
 def step_down(u: list[float]) -> Case:
-    """Return a step down of 5 to 10 cm."""
-    return Case("step down", _below(0.05 + 0.05 * u[0]), 1.0, True)
+    """Return a step down of 5 to 15 cm."""
+    return Case("step down", _below(0.05 + 0.1 * u[0]), 1.0, True, edges=(0.0,))
+
+
+def curb(u: list[float]) -> Case:
+    """Return a traffic island of 5 to 15 cm, 0.3 to 1.5 m wide, which hides the road behind it."""
+    width = 0.3 + 1.2 * u[1]
+    scene = Scene(boxes=(block(0.0, width, *_WIDE, 0.05 + 0.1 * u[0]),))
+    return Case("curb", scene, width + 0.6, True, edges=(0.0, width))
+
+
+def stairs_up(u: list[float]) -> Case:
+    """Return six steps up of 8 to 14 cm, 30 to 40 cm deep."""
+    return _stairs("stairs up", 0.08 + 0.06 * u[0], 0.3 + 0.1 * u[1])
+
+
+def stairs_down(u: list[float]) -> Case:
+    """Return six steps down of 8 to 14 cm, 30 to 40 cm deep."""
+    return _stairs("stairs down", -0.08 - 0.06 * u[0], 0.3 + 0.1 * u[1])
+
+
+def tall_grass(u: list[float]) -> Case:
+    """Return a strip of grass of 20 to 50 cm, 0.8 to 1.6 m wide, on level ground: few rays reach the ground."""
+    height, width = 0.2 + 0.3 * u[0], 0.8 + 0.8 * u[1]
+    free_path = 0.3  # [m] mean length of a ray in the grass
+
+    def disturb(points: Tensor, origin: Tensor, generator: torch.Generator) -> Tensor:
+        """End rays within the grass, as in a medium of even density."""
+        ray = points - origin
+        enter_x, exit_x = (-origin[0] / ray[:, 0], (width - origin[0]) / ray[:, 0])
+        enter_z = (height - origin[2]) / ray[:, 2].clamp(max=-1e-9)  # the camera is above the grass
+        enter = torch.maximum(enter_x, enter_z)
+        depth = torch.empty_like(enter).exponential_(1 / free_path, generator=generator)
+        end = enter + depth / ray.norm(dim=-1)
+        stopped = (ray[:, 0] > 0) & (end < exit_x.clamp(max=1.0))
+        return torch.where(stopped[:, None], origin + end[:, None] * ray, points)
+
+    return Case("tall grass", Scene(), width + 0.6, True, disturb=disturb)
+
+
+# The ground ends ------------------------------------------------------------------------------------------------------
+
+
+def ditch(u: list[float]) -> Case:
+    """Return a ditch 0.4 to 0.8 m wide and 0.25 to 0.5 m deep, with sides of the same height."""
+    width = 0.4 + 0.4 * u[0]
+    return Case("ditch", _below(0.25 + 0.25 * u[1], _beyond(width)), width + 0.8, False)
 
 
 def trench(u: list[float]) -> Case:
     """Return a trench 0.5 to 1.2 m wide and 0.8 to 2 m deep, with sides of the same height."""
     width = 0.5 + 0.7 * u[0]
-    beyond = block(width, 9.0, -9.0, 9.0, 0.0)
-    return Case("trench", _below(0.8 + 1.2 * u[1], beyond), width + 0.8, False)
+    return Case("trench", _below(0.8 + 1.2 * u[1], _beyond(width)), width + 0.8, False)
 
 
 def cliff(u: list[float]) -> Case:
@@ -73,33 +119,55 @@ def abyss(u: list[float]) -> Case:
     return Case("abyss", _below(5.0 + 5.0 * u[0]), 1.2, False)
 
 
+def glass_wall(u: list[float]) -> Case:
+    """Return a wall of glass: rays within 5 to 15 degrees of its normal return, the others see the ground behind."""
+    steepest = math.cos(math.radians(5 + 10 * u[0]))
+
+    def disturb(points: Tensor, origin: Tensor, generator: torch.Generator) -> Tensor:
+        ray = points - origin
+        is_hit = (ray[:, 0] > steepest * ray.norm(dim=-1)) & (points[:, 0] > 0)
+        return torch.where(is_hit[:, None], origin - origin[0] / ray[:, :1] * ray, points)
+
+    wall = Scene(boxes=(block(0.0, 0.04, *_WIDE, 2.0),))
+    return Case("glass wall", wall, 1.2, False, seen=Scene(), disturb=disturb)
+
+
+# Parts ----------------------------------------------------------------------------------------------------------------
+
+
+def _stairs(kind: str, rise: float, run: float, count: int = 6) -> Case:
+    """Return steps of `rise` [m], down where it is negative, and level ground before and behind them."""
+    nosings = tuple(k * run for k in range(count))
+    tops = [(x, x + run, rise * (k + 1)) for k, x in enumerate(nosings[:-1])] + [(nosings[-1], 9.0, rise * count)]
+    boxes = tuple(block(low, high, *_WIDE, top) for low, high, top in [(-9.0, 0.0, 0.0), *tops])
+    return Case(kind, Scene(terrain=_level(min(-1.0, 2 * rise * count)), boxes=boxes), nosings[-1] + 0.7, True, nosings)
+
+
 def _below(depth: float, *boxes: Box) -> Scene:
     """Return ground at z = 0 for x < 0 and `depth` [m] lower beyond."""
-
-    def terrain(x: Tensor, y: Tensor) -> Tensor:
-        return torch.full_like(x, -depth)
-
-    return Scene(terrain=terrain, boxes=(block(-9.0, 0.0, -9.0, 9.0, 0.0), *boxes))
+    return Scene(terrain=_level(-depth), boxes=(block(-9.0, 0.0, *_WIDE, 0.0), *boxes))
 
 
-KINDS: tuple[Callable[[list[float]], Case], ...] = (hump, brow, step_down, trench, cliff, abyss)
+def _beyond(width: float) -> Box:
+    """Return the far side of a ditch."""
+    return block(width, 9.0, *_WIDE, 0.0)
 
 
-def views(case: Case, generator: torch.Generator) -> dict[float, tuple[ElevationMap, float]]:
-    """Walk up to the edge; return a copy of the map and the robot's x [m] at each of VIEWS."""
-    emap, shots = ElevationMap(ElevationMapConfig(grid=GRID)), {}
-    path = walk(case.scene, [(FROM, 0.0), (TO, 0.0)], speed=SPEED, dt=DT, T_base_sensor=T_BASE_CAMERA)
-    for T_base, T_sensor, t in zip(*path, strict=True):
-        points = noisy(CAMERA.cast(case.scene, T_sensor, float(t)), generator)
-        emap.update(points[None], T_sensor[None], T_base[None], DT)
-        x = float(T_base[0, 3])
-        view = next((v for v in VIEWS if abs(x + v) < SPEED * DT / 2), None)
-        if view is not None:
-            shots[view] = (_copy(emap), x)
-    return shots
+def _level(z: float) -> Callable[[Tensor, Tensor], Tensor]:
+    return lambda x, y: torch.full_like(x, z)
 
 
-def _copy(emap: ElevationMap) -> ElevationMap:
-    copy = ElevationMap(emap.cfg)
-    copy.load_state_dict(emap.state_dict())
-    return copy
+KINDS: tuple[Callable[[list[float]], Case], ...] = (
+    hump,
+    brow,
+    step_down,
+    curb,
+    stairs_up,
+    stairs_down,
+    tall_grass,
+    ditch,
+    trench,
+    cliff,
+    abyss,
+    glass_wall,
+)

@@ -24,7 +24,7 @@ def test_only_the_fill_differs_between_deployments():
 
     text = fills.table(fills.measure((0, 10), 4, fake, lambda cfg, num_envs: 0.123))
     assert seen == [(fill, "map", 4, seed) for fill in fills.FILLS for seed in (0, 10)]
-    line = next(line for line in text.splitlines() if "completed" in line)
+    line = next(line for line in text.splitlines() if "inpaint" in line)
     assert [cell.strip() for cell in line.split("|")[1:-1]] == [
-        "`completed`", "12.3 cm", "35.0 % (30.0 to 40.0)", "35 %", "35 %", "25 %"
+        "`inpaint`", "12.3 cm", "25.0 % (20.0 to 30.0)", "25 %", "25 %", "25 %"
     ]  # fmt: skip

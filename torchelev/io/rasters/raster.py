@@ -142,7 +142,7 @@ class Raster:
         limit = emap.cfg.fusion.max_variance
         hint = "give a smaller one to Raster.open"
         require(self.variance < limit, "variance", f"must be below fusion.max_variance, {limit:g}", self.variance, hint)
-        state = emap.measured_state
+        state = emap.state
         if T_map_base is not None:
             state = center_on(state, emap, T_map_base, chosen)
         elevation = torch.full(state.elevation.shape, torch.nan)

@@ -75,7 +75,6 @@ constexpr Setting SETTINGS[] = {
     {"traversability.critical_step", NUMBER, false, false, {0.2}},
     {"traversability.critical_roughness", NUMBER, false, false, {0.05}},
     {"traversability.robot", IGNORED, true, true, {}},
-    {"completion", ONLY_PYTHON, true, true, {}},
     {"levels", GROUP, true, true, {}},
     {"levels.max_levels", INTEGER, false, false, {3}},
     {"levels.min_gap", NUMBER, false, false, {0.4}},

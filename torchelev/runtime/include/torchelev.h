@@ -30,7 +30,7 @@ typedef enum {
     TORCHELEV_OK = 0,
     TORCHELEV_BAD_VALUE = 1,   /**< an argument or a setting breaks a rule */
     TORCHELEV_BAD_FILE = 2,    /**< a file cannot be read or written, is damaged, or is of another version */
-    TORCHELEV_UNSUPPORTED = 3, /**< a setting needs Python: completion, a learned head, some filters */
+    TORCHELEV_UNSUPPORTED = 3, /**< a setting needs Python: a learned head, some filters */
     TORCHELEV_NO_MEMORY = 4    /**< there is not enough memory */
 } torchelev_status;
 

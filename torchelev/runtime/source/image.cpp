@@ -31,9 +31,6 @@ std::vector<std::string> channels_of(const Layout& layout, bool has_levels) {
     if (layers.kind == Json::NUL) return {"elevation", "validity", "upper_bound", "traversability"};
     std::vector<std::string> names;
     for (const Json& layer : layers.items) {
-        const bool is_completed = layer.text == "completed" || layer.text == "completed_std";
-        REQUIRE(!is_completed, "image.layers", "needs Python: this library has no completion", "'" + layer.text + "'",
-                "leave it out", TORCHELEV_UNSUPPORTED);
         place_of("image.layers", layer.text, CHANNELS);
         REQUIRE(layer.text != "clearance" || has_levels, "image.layers", "needs a map with levels, which knows ceilings",
                 "'clearance'", "give the map levels, or leave it out");

@@ -36,8 +36,6 @@ Rule rule_of(const std::string& name, const Json& value, const char* usual) {
     REQUIRE(is_name, name, "must be the name of a rule or a number", value.describe(), std::string("use ") + usual);
     const std::string text = value.kind == Json::STRING ? value.text : usual;
     if (text == "inf" || text == "-inf") return {NO_RULE, text == "inf" ? INFINITY : -INFINITY};
-    REQUIRE(text != "completed", name, "needs Python: this library has no completion", "'completed'", "use ground",
-            TORCHELEV_UNSUPPORTED);
     switch (place_of(name, text, {"ground", "original", "base", "lowest", "upper_bound", "inpaint"})) {
         case 0:
             return {scans::GROUND};

@@ -204,7 +204,7 @@ class RobotLink(SiteReader):
         require(not (chosen & ~own).any(), "env_ids", "must be environments of the link", "others", hint)
         if not self.flush():
             raise TimeoutError("site: a merger must acknowledge all that was published first, got no answer")
-        whole = map_layers(lambda value: value.cpu(), emap.measured_state)
+        whole = map_layers(lambda value: value.cpu(), emap.state)
         if T_map_base is not None:
             whole = center_on(whole, emap, T_map_base.cpu(), chosen)
         after = self._fill(whole, chosen)

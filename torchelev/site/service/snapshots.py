@@ -51,7 +51,7 @@ def read_snapshot(emap: ElevationMap, envs: Int[Tensor, "E"], time: float) -> Sn
         chosen = value.index_select(0, envs.to(value.device)).cpu()
         return chosen.float() if chosen.dtype in (torch.float16, torch.bfloat16) else chosen
 
-    windows = read_windows(emap, emap.measured_state, time, None)
+    windows = read_windows(emap, emap.state, time, None)
     known = Known(*map(copy, windows.known))
     layers = {name: getattr(known, name).float() for name in ("elevation", "variance", "age")}
     surface = {name: copy(getattr(windows, name)) for name in _SURFACE}

@@ -15,12 +15,10 @@ from envs.terrain_nav.robot import base_pose
 from torchelev.robot import RobotConfig
 from torchelev.sim import CourseConfig, HeightField, make_course, make_terrain
 from torchelev.sim.poses import pose_from_rotation_vector
-from training.traversability.maps.collage import make_collage
 
 # Fixed before the first training. "obstacles" are the blocks, pits and steps of TerrainNav's course.
 KINDS = ("slope", "stairs_up", "stairs_down", "boxes", "gaps", "rough", "rails", "obstacles")
 UNSEEN_KINDS = ("stepping_stones",)  # never trained on
-COLLAGE = "collage"  # for trainings that must know ground of kinds that nobody thought of
 
 LENGTH, RESOLUTION = 8.0, 0.02  # [m] side of a tile and distance of its samples
 _STRETCH = (0.5, 2.0)  # factor on a tile's heights, for slopes and steps that robots cannot overcome
@@ -58,9 +56,7 @@ def _tile(kind: str, rng: np.random.Generator) -> Tensor:
     seed, difficulty = int(rng.integers(2**31)), float(rng.random())
     stretch, gradient, heading = rng.uniform(*_STRETCH), rng.uniform(0, _MAX_GRADIENT), rng.uniform(-math.pi, math.pi)
     axis = (torch.arange(round(LENGTH / RESOLUTION) + 1) - LENGTH / RESOLUTION / 2) * RESOLUTION
-    if kind == COLLAGE:
-        heights = make_collage(axis, rng)
-    elif kind == "obstacles":
+    if kind == "obstacles":
         course = CourseConfig(num_tiles=1, length=LENGTH, resolution=RESOLUTION, seed=seed, num_routes=1)
         heights = make_course(course).field.heights[0]
     else:
