@@ -1,15 +1,15 @@
-"""Write the tables of the README and of docs/benchmarks.md from the results, so that every number comes from a run.
+"""Write the tables of the README and of the pages from the results, so that every number comes from a run.
 
     python -m docs.readme_tables
 
-Each table is between <!-- name --> and <!-- end -->. docs/benchmarks.md holds every table, the other
-pages a selection. A table whose result does not exist yet stays empty, and its name is printed.
+Each table is between <!-- name --> and <!-- end -->. docs/benchmarks.md, the summary, and the pages of docs/benchmarks/
+together hold every table once, the README and the other pages a selection. A table whose result does not exist yet
+stays empty, and its name is printed.
 """
 
 from __future__ import annotations
 
 import functools
-import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -23,6 +23,7 @@ from benchmarks.quality import (
     em_cupy,
     mjlab_task,
     mjlab_training,
+    obstacles,
     pose_covariance,
 )
 from benchmarks.quality.changes import report as changes
@@ -53,6 +54,8 @@ from benchmarks.speed import levels as levels_speed
 from benchmarks.speed.postprocessing import __main__ as postprocessing
 from benchmarks.speed.site import site_area, site_engines, site_merge, site_ranks, site_service
 from benchmarks.speed.update import tables
+from docs import summary_tables as summary
+from docs.results import GPU, SPEED, load
 from torchelev.app.results import markdown_table
 from training.nav import ceiling_experiment, encoder_experiment, experiment, fill_experiment
 from training.quadruped import experiment as legs
@@ -60,31 +63,23 @@ from training.quadruped import fills, step_time
 from training.traversability import block, evaluate
 
 ROOT = Path(__file__).parents[1]
-GPU = "gpu-nvidia-h100-80gb-hbm3"
-SPEED = "speed-2-x-amd-epyc-2-threads"
-_SHOWN = ("turn none", "turn noisy", "turn outliers", "walk noisy", "walk outliers", "lidar noisy", "lidar outliers")
-
-
-def load(name: str, folder: Path = benchmarks.RESULTS) -> dict[str, Any]:
-    """Read a result."""
-    return json.loads((folder / f"{name}.json").read_text())
 
 
 def _accuracy() -> str:
     """Tabulate the RMSE of map / mean [mm] by scene, and count the cases that meet their targets."""
     rows = load("accuracy")["rows"]
-    cells = {(r["scene"], f"{r['motion']} {r['noise']}"): f"{r['rmse']:.1f} / {r['rmse_mean']:.1f}" for r in rows}
-    scenes = list(dict.fromkeys(r["scene"] for r in rows))
-    table = markdown_table(["scene", *_SHOWN], [[scene, *(cells[scene, case] for case in _SHOWN)] for scene in scenes])
+    cells = {(f"{r['motion']}, {r['noise']}", r["scene"]): f"{r['rmse']:.1f} / {r['rmse_mean']:.1f}" for r in rows}
+    cases, scenes = (list(dict.fromkeys(names)) for names in zip(*cells, strict=True))
+    table = markdown_table(["motion, noise", *scenes], [[case, *(cells[case, s] for s in scenes)] for case in cases])
     failed = [f"*{r['scene']} {r['motion']} {r['noise']}*" for r in rows if not r["holds"]]
-    verdict = f"not {', '.join(failed)}" if failed else "all of them"
-    return f"{table}\n\n{len(rows) - len(failed)} of {len(rows)} cases hold their bars: {verdict}."
+    missed = f"; missed: {', '.join(failed)}" if failed else ""
+    return f"{table}\n\n{len(rows) - len(failed)} of {len(rows)} cases meet their targets{missed}."
 
 
 def _features() -> str:
     """Tabulate the figures that have a target."""
     rows = [list(r.values()) for r in load("features")["rows"] if r["bar"]]
-    return markdown_table(["feature", "figure", "on", "off", "baseline", "bar", ""], rows)
+    return markdown_table(["feature", "figure", "on", "off", "baseline", "target", ""], rows)
 
 
 def _real() -> str:
@@ -102,13 +97,14 @@ def _real() -> str:
 def _occlusion() -> str:
     """Tabulate how often each rule for unknown ground is right [%]."""
     found = load("occlusion")
-    return occlusion.table(found["right [%]"], found["footholds within 3 cm [%]"])
+    table = _transposed(occlusion.table(found["right [%]"], found["footholds within 3 cm [%]"]))
+    return table.replace("in-painted by ", "").replace("| rule |", "| ground |")
 
 
-def _speed() -> str:
-    """Tabulate sensors, stages, robots and targets."""
+def _speed_robots() -> str:
+    """Tabulate time and memory against the number of robots, and show the figure."""
     picture = f"![Time against points, robots, cells and ray length](benchmarks/results/{SPEED}.png)"
-    return f"{tables.report(load(SPEED))}\n\n{picture}"
+    return f"{tables.robots(load(SPEED))}\n\n{picture}"
 
 
 def _ros2() -> str:
@@ -138,26 +134,48 @@ def _long_run() -> str:
     return growth.table({name: values for name, values in load("long_run").items() if name in long_run.CASES})
 
 
-def _postprocessing() -> str:
-    """Tabulate the times of filters and plane segmentation."""
-    result = load("postprocessing")
-    return f"{postprocessing.table(result['rows'])}\n\n{postprocessing.planes_table(result['planes'])}"
-
-
 def _self_filter() -> str:
     """Tabulate what the self-filter takes, leaves and costs."""
     return self_filter.tables({name: value for name, value in load("self_filter").items() if name != "walking"})
 
 
-def _traversability() -> str:
-    """Tabulate the quality of the traversability heads on each split."""
-    result = load("traversability", training.RESULTS)
-    titles = {
-        "held_out": "Kinds of ground that it trained on",
-        "unseen": "Stepping stones, which it never saw",
-        "held_out_exact": "Maps of the true heights, to at most 1 cm of white noise, of the kinds that it trained on",
-    }
-    return "\n\n".join(f"{title}:\n\n{evaluate.table(result, split)}" for split, title in titles.items())
+def _traversability(split: str) -> str:
+    """Tabulate the quality of the traversability heads on a split, a table for each size of cells."""
+    result = load("traversability", training.RESULTS)[split]
+    return "\n\n".join(_traversability_at(cells, heads) for cells, heads in result.items())
+
+
+def _traversability_at(cells: str, heads: dict[str, Any]) -> str:
+    """Tabulate the quality of the heads at one size of cells, a column each."""
+    rows = _cells(evaluate.table({"": {cells: heads}}, ""))
+    head, *rows = [list(row) for row in zip(*(row[1:] for row in rows), strict=True)]
+    return markdown_table([f"cells of {cells}", *head[1:]], rows)
+
+
+def _cells(table: str) -> list[list[str]]:
+    """Return the cells of a Markdown table, the head first."""
+    head, _, *rows = [line[2:-2].split(" | ") for line in table.splitlines()]
+    return [head, *rows]
+
+
+def _transposed(table: str) -> str:
+    """Return a Markdown table with rows for columns."""
+    head, *rows = [list(row) for row in zip(*_cells(table), strict=True)]
+    return markdown_table(head, rows)
+
+
+def _upright(make: Callable[[], str]) -> Callable[[], str]:
+    """Return what makes a table with rows for columns."""
+    return lambda: _transposed(make())
+
+
+def _in_parts(make: Callable[[], str], *names: str) -> dict[str, Callable[[], str]]:
+    """Return by its name what makes each of the tables that a function returns in one text; the last takes the rest."""
+
+    def part(number: int) -> str:
+        return make().split("\n\n", len(names) - 1)[number]
+
+    return {name: functools.partial(part, number) for number, name in enumerate(names)}
 
 
 def _made_by(
@@ -167,59 +185,72 @@ def _made_by(
     return lambda: make(load(name, folder) if part is None else load(name, folder)[part])
 
 
-TABLES = {
+TABLES: dict[str, Callable[[], str]] = {
+    "summary_speed": summary.speed,
+    "summary_accuracy": summary.accuracy,
+    "summary_learning": summary.learning,
+    "summary_limits": summary.limits,
     "accuracy": _accuracy,
     "features": _features,
-    "changes": _made_by(changes.tables, "changes"),
+    **_in_parts(_made_by(changes.tables, "changes"), "changes", "changes_aging", "changes_left"),
     "real": _real,
-    "speed": _speed,
+    "speed": _upright(_made_by(tables.sensors, SPEED)),
+    "speed_threads": _made_by(tables.threads, SPEED),
+    "speed_stages": _made_by(tables.stages, SPEED),
+    "speed_robots": _speed_robots,
+    "speed_targets": _made_by(tables.verdicts, SPEED),
     "loop": _made_by(loop.table, "loop", "rows"),
     "runtime_speed": _made_by(runtime.speed_table, "runtime_speed"),
     "runtime_replay": _made_by(runtime.replay_table, "runtime_replay"),
     "runtime_spacing": _made_by(spacing.table, "runtime_spacing"),
     "runtime_processors": _made_by(runtime.processors_table, "runtime_processors"),
     "ros2": _ros2,
-    "long_run": _long_run,
+    "long_run": _upright(_long_run),
     "odometry": _made_by(odometry.table, "odometry"),
-    "bags": _made_by(bags.table, "bags", "rows"),
+    "bags": _upright(_made_by(bags.table, "bags", "rows")),
     "live_view": _made_by(live_view.table, "live_view"),
     "site_engines": _made_by(site_engines.table, "site_engines", "rows"),
-    "site_merge": _made_by(site_merge.table, "site_merge", "rows"),
+    "site_merge": _upright(_made_by(site_merge.table, "site_merge", "rows")),
     "site_area": _made_by(site_area.table, "site_area", "rows"),
-    "site_ranks": _made_by(site_ranks.table, "site_ranks"),
-    "site_service": _made_by(site_service.table, "site_service"),
+    "site_ranks": _upright(_made_by(site_ranks.table, "site_ranks")),
+    "site_service": _upright(_made_by(site_service.table, "site_service")),
     "real_merged": _made_by(merged.table, "real_merged", "rows"),
     "nav": _made_by(experiment.table, "nav", folder=training.RESULTS),
     "pose_covariance": _made_by(pose_covariance.table, "pose_covariance"),
-    "legs": _made_by(legs.table, "quadruped", folder=training.RESULTS),
+    "legs": _upright(_made_by(legs.table, "quadruped", folder=training.RESULTS)),
     "legs_stairs": _made_by(legs.stairs_table, "quadruped", folder=training.RESULTS),
     "legs_walk": _made_by(legs.walk_table, "quadruped", folder=training.RESULTS),
-    "legs_fills": _made_by(fills.table, "quadruped_fills", folder=training.RESULTS),
+    "legs_fills": _upright(_made_by(fills.table, "quadruped_fills", folder=training.RESULTS)),
     "legs_step_time": _made_by(step_time.table, "quadruped-step-time", folder=training.RESULTS),
     "encoder_success": _made_by(encoder_experiment.table, "encoders", folder=training.RESULTS),
-    "fill": _made_by(fill_experiment.table, "fill", folder=training.RESULTS),
+    "fill": _upright(_made_by(fill_experiment.table, "fill", folder=training.RESULTS)),
     "ceilings": _made_by(ceiling_experiment.table, "ceilings", folder=training.RESULTS),
     "encoder_cost": _made_by(encoders.table, "encoders", "rows"),
     "sensors": _made_by(sensors.table, "sensors", "cases"),
     "structures": _made_by(structures.table, "structures"),
     "sight": _made_by(sight.table, "sight", "rows"),
     "mjlab": _made_by(mjlab_task.table, "mjlab"),
-    "channels": _made_by(channels.table, "channels"),
+    **_in_parts(_made_by(channels.table, "channels"), "channels", "channels_images"),
     "classes": _made_by(classes.table, "classes"),
-    "levels": _made_by(levels.table, "levels"),
+    **_in_parts(_made_by(levels.table, "levels"), "levels", "levels_peers", "levels_space"),
     "levels_accuracy": _made_by(one_height.table, "levels_accuracy", "rows"),
-    "levels_speed": _made_by(levels_speed.table, "levels_speed"),
-    "em_cupy": _made_by(em_cupy.table, "em_cupy"),
+    **_in_parts(_made_by(levels_speed.table, "levels_speed"), "levels_speed", "levels_voxels"),
+    **_in_parts(_made_by(em_cupy.table, "em_cupy"), "em_cupy", "em_cupy_channels"),
     "mjlab_training": _made_by(mjlab_training.table, "mjlab_training"),
     "isaac_lab": _made_by(isaac_lab.table, "isaac_lab"),
     "self_filter_walking": _made_by(walking.table, "self_filter", "walking"),
-    "postprocessing": _postprocessing,
+    "postprocessing": _made_by(postprocessing.table, "postprocessing", "rows"),
+    "planes": _made_by(postprocessing.planes_table, "postprocessing", "planes"),
     "occlusion": _occlusion,
-    "traversability": _traversability,
+    "traversability": functools.partial(_traversability, "held_out"),
+    "traversability_unseen": functools.partial(_traversability, "unseen"),
+    "traversability_exact": functools.partial(_traversability, "held_out_exact"),
+    "obstacles": _made_by(obstacles.table, "obstacles", "rows"),
     "head": _made_by(head.table, "head", "rows"),
     "block": _made_by(block.table, "block", "profiles", folder=training.RESULTS),
-    "self_filter": _self_filter,
+    **_in_parts(_self_filter, "self_filter", "self_filter_padding"),
     "gpu": _made_by(gpu.table, GPU),
+    "gpu_many": _made_by(gpu.costs, GPU),
 }
 
 

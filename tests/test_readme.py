@@ -1,4 +1,4 @@
-"""The README and the benchmarks page: their tables are those of the results, and the README's code runs."""
+"""The README and the pages of benchmarks: their tables are those of the results, and the README's code runs."""
 
 import pytest
 
@@ -14,8 +14,20 @@ def test_tables_are_those_of_the_results(page):
     assert with_tables(text, PAGES[page]) == text, "run python -m docs.readme_tables"
 
 
-def test_the_benchmarks_page_has_every_table_once():
-    assert sorted(names_of_tables((ROOT / "docs/benchmarks.md").read_text())) == sorted(TABLES)
+def test_the_summary_and_the_pages_of_benchmarks_have_every_table_once():
+    summary, *details = [ROOT / "docs/benchmarks.md", *sorted((ROOT / "docs/benchmarks").glob("*.md"))]
+    names = {page: names_of_tables(page.read_text()) for page in (summary, *details)}
+    assert sorted(name for page in names for name in names[page]) == sorted(TABLES)
+    assert [name for name in TABLES if name.startswith("summary_")] == names[summary] and all(names.values())
+
+
+def test_each_table_has_a_caption_and_each_page_its_commands():
+    for page in sorted((ROOT / "docs/benchmarks").glob("*.md")):
+        text = page.read_text()
+        assert "**Rerun**: `" in text
+        for name in names_of_tables(text):
+            caption = text.split(f"<!-- {name} -->")[0].rstrip().split("\n\n")[-1]
+            assert caption.endswith(".") and not caption.startswith(("#", "|", "<")), f"{page.name}: {name}"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -38,7 +50,7 @@ def test_writes_a_table_in_place_of_an_old_one():
     old = "<!-- loop -->\nold\n<!-- end -->\nkept\n<!-- other -->\n"
     new = with_tables(old)
     assert "p99" in new and "old" not in new and new.endswith("<!-- end -->\nkept\n<!-- other -->\n")
-    assert "(../benchmarks/results/" in with_tables("<!-- speed -->\n<!-- end -->", "../")
+    assert "(../benchmarks/results/" in with_tables("<!-- speed_robots -->\n<!-- end -->", "../")
 
 
 @pytest.mark.slow(10)

@@ -29,6 +29,20 @@ def table(result: dict[str, Any]) -> str:
     return markdown_table([f"{device}, ms: median (fastest)", "uncompiled", "compiled", "CUDA graph"], rows)
 
 
+def costs(result: dict[str, Any]) -> str:
+    """Tabulate an update of many robots beside a copy of its bytes, and its longest kernels."""
+    num_bytes, robots = result["many robots, expected bytes"], result["many robots"]["robots"]
+    copied, update = 1e3 * num_bytes / result["copy, bytes per second"], result["many robots, captured"]["median"]
+    rows = [
+        ["copy of points, map and table", f"{num_bytes / 1e9:.1f} GB, {copied:.1f} ms"],
+        ["update, captured", f"{update:.1f} ms, {update / copied:.0f} times the copy"],
+        ["memory per robot", f"{result['many robots, bytes per robot'] / 1e3:.0f} kB"],
+    ]
+    kernels = list(result["many robots, slowest kernels"].items())[:4]
+    rows += [[f"kernel `{name.split(' ')[0]}`", f"{time:.2f} ms"] for name, time in kernels]
+    return markdown_table([f"{robots:,} robots", ""], rows)
+
+
 def verdicts(result: dict[str, Any]) -> list[list[str]]:
     """Return a row for each target that was measured: case, value, limit, verdict."""
     rows = []

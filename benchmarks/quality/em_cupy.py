@@ -146,12 +146,12 @@ def time_updates() -> dict[str, float]:
 
 
 def table(result: dict[str, Any]) -> str:
-    """Tabulate the shares."""
+    """Tabulate the shares [%]: after one step / in the run."""
     rows = [
-        [scene, *(f"{100 * found[kind][key]:.1f}" for kind in ("step", "run") for key in COLUMNS)]
+        [scene, *(" / ".join(f"{100 * found[kind][key]:.1f}" for kind in ("step", "run")) for key in COLUMNS)]
         for scene, found in result["scenes"].items()
     ]
-    head = [f"{kind}: {key.replace('_', ' ')}" for kind in ("one step", "run") for key in COLUMNS]
+    head = [key.replace("_", " ") for key in COLUMNS]
     own, usual = (f"{result['milliseconds'][name]:.1f}" for name in ("like_em_cupy", "default"))
     note = f"An update with {BPEARL:,} points: {own} ms, {usual} by default; one robot, {result['threads']} threads."
     return f"{markdown_table(['scene', *head], rows)}\n\n{channels_table(result['channels'])}\n\n{note}"

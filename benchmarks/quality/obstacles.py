@@ -8,6 +8,7 @@ the greatest height [cm] that `plan` crosses, and that `check_path` calls safe o
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from torchelev.planning.planner import plan
 RESULTS = Path(__file__).parents[1] / "results"
 RESOLUTIONS = (0.02, 0.04, 0.05, 0.1)  # [m]
 HEIGHTS = (0.05, 0.1, 0.12, 0.16, 0.18, 0.2, 0.25, 0.3, 0.4, 0.6, 0.8)  # [m]
+RATED = (0.1, 0.12, 0.16, 0.2)  # [m] the heights whose ratings the table shows
 SHAPES: dict[str, Callable[[Tensor], Tensor]] = {  # heights by x [m], of an obstacle 1 m high
     "cliff": lambda x: -(x > 0).to(x.dtype),
     "wall": lambda x: ((x > 0) & (x < 0.1)).to(x.dtype),
@@ -55,36 +57,42 @@ def measure(shape: str, height: float, resolution: float, head: TraversabilityCo
     return row | {"plan": bool(path.reached), "check": bool(check.safe), "reason": check.explain()[0]}
 
 
-def _limits(rows: list[dict[str, Any]], name: str) -> str:
-    """Return the highest obstacle that was crossed [cm], if no lower one was refused; else all of them."""
-    crossed = [row["height"] for row in rows if row[name]]
-    is_prefix = crossed == [row["height"] for row in rows][: len(crossed)]
-    return f"{100 * max(crossed):.0f}" if crossed and is_prefix else ", ".join(f"{100 * h:.0f}" for h in crossed) or "-"
+def table(rows: list[dict[str, Any]]) -> str:
+    """Tabulate each obstacle: the lowest and highest rating and limit [cm] over all sizes of cells."""
+    lines = []
+    for head, shape in dict.fromkeys((row["head"], row["obstacle"]) for row in rows):
+        found = [row for row in rows if (row["head"], row["obstacle"]) == (head, shape)]
+        ratings = [_span([row["rating"] for row in found if row["height"] == h], 2) for h in RATED]
+        by_cells = [[row for row in found if row["resolution"] == cells] for cells in RESOLUTIONS]
+        limits = [_span([_highest(of_cells, name) for of_cells in by_cells], 0) for name in ("plan", "check")]
+        lines.append([head, shape, *ratings, *limits])
+    titles = [f"{100 * h:.0f} cm" for h in RATED]
+    return markdown_table(["head", "obstacle", *titles, "`plan` [cm]", "`check_path` [cm]"], lines)
+
+
+def _span(values: list[float], digits: int) -> str:
+    """Return the lowest and highest value, or one if they read the same."""
+    return " to ".join(dict.fromkeys(f"{value:.{digits}f}" for value in (min(values), max(values))))
+
+
+def _highest(rows: list[dict[str, Any]], name: str) -> float:
+    """Return the height [cm] of the highest obstacle that was crossed, as all lower ones were; 0 for none."""
+    return max((100 * row["height"] for row in itertools.takewhile(lambda row: row[name], rows)), default=0.0)
 
 
 @click.command(help=__doc__)
 @click.option("--out", type=click.Path(path_type=Path), default=RESULTS / "obstacles.json", help="JSON file to write.")
 def main(out: Path) -> None:
     """Measure, write JSON and print the table."""
-    rows, table = [], []
-    for name, head in HEADS.items():
-        for shape in SHAPES:
-            for resolution in RESOLUTIONS:
-                found = [measure(shape, height, resolution, head) for height in HEIGHTS]
-                rows += [{"head": name} | row for row in found]
-                ratings = [f"{found[k]['rating']:.2f}" for k in (1, 2, 3, 5)]
-                highest = [_limits(found, judge) for judge in ("plan", "check")]
-                table.append([name, shape, f"{100 * resolution:.0f}", *ratings, *highest])
-    write_json(out, {"machine": machine(), "rows": rows})
-    heads = [
-        "head",
-        "obstacle",
-        "cells [cm]",
-        *(f"rating at {h}" for h in (10, 12, 16, 20)),
-        "plan to [cm]",
-        "check to [cm]",
+    rows = [
+        {"head": name} | measure(shape, height, resolution, head)
+        for name, head in HEADS.items()
+        for shape in SHAPES
+        for resolution in RESOLUTIONS
+        for height in HEIGHTS
     ]
-    click.echo(markdown_table(heads, table))
+    write_json(out, {"machine": machine(), "rows": rows})
+    click.echo(table(rows))
 
 
 if __name__ == "__main__":

@@ -5,7 +5,8 @@
     ```
 
 Its body may say a sentence about each field, `name: text`, for the last column; then it must do so for all fields, so
-that a new field cannot be forgotten. The option `:heads:` names the columns.
+that a new field cannot be forgotten. The option `:heads:` names the columns. The site's search and index find each
+row by the name of its field, and {field}`GridConfig.resolution` links to it.
 """
 
 from __future__ import annotations
@@ -19,9 +20,11 @@ from typing import Any
 
 from docutils import nodes
 from docutils.parsers.rst import directives
+from sphinx import addnodes
 from sphinx.application import Sphinx
 from sphinx.pycode import ModuleAnalyzer
 from sphinx.util.docutils import SphinxDirective
+from sphinx.util.nodes import make_id
 
 UNIT = re.compile(r"^\[([^\]]+)\] ?")
 
@@ -101,7 +104,16 @@ class Fields(SphinxDirective):
         parsed = self.parse_text_to_nodes(table(cls, self._heads(cls, bool(notes)), notes))
         for node in parsed:
             node["classes"].append("fields")
-        return parsed
+        rows = [row for node in parsed for body in node.findall(nodes.tbody) for row in body]
+        return [*map(self._target, comments(cls), rows), *parsed]
+
+    def _target(self, field: str, row: nodes.Element) -> addnodes.index:
+        """Make a row the target of its field, and return its entry in the index."""
+        owner = self.arguments[0].rpartition(".")[2]
+        target = make_id(self.env, self.state.document, "", f"{owner}.{field}")
+        row["ids"].append(target)
+        self.env.domains.standard_domain.note_object("field", f"{owner}.{field}", target, location=row)
+        return addnodes.index(entries=[("single", f"{field} ({owner})", target, "", None)])
 
     def _heads(self, cls: type, noted: bool) -> list[str]:
         if "heads" in self.options:
@@ -113,4 +125,5 @@ class Fields(SphinxDirective):
 def setup(app: Sphinx) -> dict[str, bool]:
     """Register the directive."""
     app.add_directive("fields", Fields)
+    app.add_object_type("field", "field", objname="field")
     return {"parallel_read_safe": True}

@@ -11,7 +11,7 @@ baseline: point transform, noise and height update only; everything that can be 
 All three map the same recording of a walk with bob, roll and pitch at 5 Hz: the scene's exact returns with range noise
 (3 mm + 1.5 mm/m^2 * d^2 for the camera, 1 cm for the lidar), of which 2 % are lost. Cells are 4 cm. The truth of a
 cell is the height of the ground at its center. Each metric is defined in the docstring of its function in
-benchmarks/quality/features; a bar is the target with the feature on.
+benchmarks/quality/features; targets are of the feature switched on.
 
 Prints a table and writes features.json and features.png, which shows some of the maps where they differ.
 """
@@ -38,7 +38,7 @@ def main(out: Path, only: str) -> None:
     rows = table_rows(outcomes)
     click.echo(markdown_table(HEAD, rows))
     failed = [f"{row[0]}: {row[1]}" for row in rows if row[-1] == "FAIL"]
-    click.echo(f"\n{len(failed)} bars fail" + "".join(f"\n  {line}" for line in failed))
+    click.echo(f"\n{len(failed)} targets missed" + "".join(f"\n  {line}" for line in failed))
     if not only:
         settings = {name: cfg.to_dict() for name, cfg in configurations("raycast").items()}
         named = [dict(zip(HEAD, row, strict=True)) for row in rows]

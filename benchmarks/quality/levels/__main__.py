@@ -150,33 +150,42 @@ def measure(libraries: Iterable[str], python: str) -> dict[str, Any]:
     return {"walks": walks, "beside": beside}
 
 
-def _cells(row: dict[str, Any], extra: bool) -> list[str]:
-    """Return a row of the table."""
+_SURFACES = {
+    "right": ("right %", 100, 2),
+    "unknown": ("unknown %", 100, 1),
+    "ground_rmse": ("ground [cm]", 100, 2),
+    "ceiling_rmse": ("ceiling [cm]", 100, 2),
+    "missed": ("missed %", 100, 2),
+    "false": ("false %", 100, 2),
+    "milliseconds": ("ms", 1, 1),
+}  # column: title, scale, digits
+_SPACE = {
+    "free_as_occupied": ("free called occupied %", 100, 2),
+    "free_unknown": ("free unknown %", 100, 1),
+    "occupied_as_free": ("occupied called free %", 100, 2),
+    "megabytes": ("MB", 1, 1),
+}
 
-    def text(name: str, scale: float, digits: int) -> str:
-        return f"{scale * row[name]:.{digits}f}" if row[name] is not None and math.isfinite(row[name]) else "-"
 
-    columns = [("right", 100, 2), ("unknown", 100, 1), ("ground_rmse", 100, 2), ("ceiling_rmse", 100, 2)]
-    columns += [("missed", 100, 2), ("false", 100, 2)]
-    if extra:
-        columns += [("free_as_occupied", 100, 2), ("free_unknown", 100, 1), ("occupied_as_free", 100, 2)]
-        columns += [("megabytes", 1, 1)]
-    return [text(*column) for column in [*columns, ("milliseconds", 1, 1)]]
+def _tabulate(walks: dict[str, dict[str, Any]], columns: dict[str, tuple[str, int, int]]) -> str:
+    """Tabulate columns of all maps on all walks."""
+
+    def text(value: float | None, scale: int, digits: int) -> str:
+        return f"{scale * value:.{digits}f}" if value is not None and math.isfinite(value) else "-"
+
+    rows = [
+        [walk, name, *(text(row[key], scale, digits) for key, (_, scale, digits) in columns.items())]
+        for walk, maps in walks.items()
+        for name, row in maps.items()
+    ]
+    return markdown_table(["walk", "map", *(title for title, *_ in columns.values())], rows)
 
 
 def table(result: dict[str, Any]) -> str:
-    """Tabulate all walks, and those beside other maps."""
-    head = ["right surface %", "unknown %", "ground RMSE [cm]", "ceiling RMSE [cm]", "ceilings missed %", "false %"]
-    extra = ["free called occupied %", "free unknown %", "occupied called free %", "MB"]
-    tables = []
-    for key, names in (("walks", [*head, "ms"]), ("beside", [*head, *extra, "ms"])):
-        rows = [
-            [walk, name, *_cells(row, key == "beside")]
-            for walk, maps in result[key].items()
-            for name, row in maps.items()
-        ]
-        tables += [markdown_table(["walk", "map", *names], rows)] if rows else []
-    return "\n\n".join(tables)
+    """Tabulate the surfaces of all walks, those beside other maps, and the space between them."""
+    beside = result["beside"]
+    parts = [_tabulate(beside, columns) for columns in (_SURFACES, _SPACE)] if beside else []
+    return "\n\n".join([_tabulate(result["walks"], _SURFACES), *parts])
 
 
 def main() -> None:
