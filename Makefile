@@ -14,8 +14,9 @@ MUJOCO := .venv-mujoco
 ISAACLAB := .venv-isaaclab
 NEWTON := .venv-newton
 GENESIS := .venv-genesis
+PEERS := .venv-peers
 
-.PHONY: help wheel demo test test-fast test-library test-mjlab test-mujoco train-mjlab test-isaaclab bench-isaaclab test-newton test-genesis test-ros2 test-ros2-torch bench-ros2 matrix lint types setup bench quality quality-em-cupy quality-levels quality-odometry train-ceilings runtime docs clean
+.PHONY: help wheel demo test test-fast test-library test-mjlab test-mujoco train-mjlab test-isaaclab bench-isaaclab test-newton test-genesis test-ros2 test-ros2-torch bench-ros2 matrix lint types setup bench quality quality-em-cupy quality-levels quality-odometry train-ceilings peers runtime docs clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 12
@@ -133,6 +134,23 @@ train-mjlab: $(MJLAB)/.ready  ## train in mjlab's rough task with the map and th
 
 test-mjlab: $(MJLAB)/.ready  ## run the observation term in mjlab, in the environment .venv-mjlab
 	$(MJLAB)/bin/python -m pytest tests/integrations/test_mjlab_simulator.py
+
+# Peers are pinned; VDBFusion has wheels for Python 3.6 to 3.10 only, and runs in a second environment where there is one.
+PEERS_PYTHON ?= $(shell ls -d $${PYENV_ROOT:-$$HOME/.pyenv}/versions/3.10.*/bin/python 2>/dev/null | head -1)
+PEERS_RECORDINGS ?=
+$(PEERS)/.ready: benchmarks/peers/requirements.txt $(BIN)/.demo-ready
+	@echo "Installing PyTorch, Open3D and the other peers into $(PEERS) and $(PEERS)-310, nowhere else: 5 GB."
+	$(PYTHON) -m venv $(PEERS)
+	$(PEERS)/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt \
+		--editable '.[io]' scipy --requirement $<
+	-$(if $(PEERS_PYTHON),$(PEERS_PYTHON),python3.10) -m venv $(PEERS)-310 && $(PEERS)-310/bin/python -m pip install --quiet \
+		--disable-pip-version-check vdbfusion==0.1.6 open3d==0.19.0 'numpy<2'
+	@touch $@
+
+peers: $(PEERS)/.ready  ## compare with other maps, in the environment .venv-peers; under thirty minutes
+	$(PEERS)/bin/python -W ignore -m benchmarks.peers --python $(PEERS)-310/bin/python \
+		$(if $(PEERS_RECORDINGS),--recordings $(PEERS_RECORDINGS))
+	$(BIN)/python -m docs.readme_tables
 
 matrix: $(MATRIX:%=on-%)  ## run the library's quick tests on Python 3.10, 3.12 and 3.13, where they are installed
 

@@ -18,6 +18,7 @@ from typing import Any
 import benchmarks
 import training
 from benchmarks.gpu import report as gpu
+from benchmarks.peers import report as peers
 from benchmarks.quality import (
     classes,
     em_cupy,
@@ -188,8 +189,13 @@ def _made_by(
 TABLES: dict[str, Callable[[], str]] = {
     "summary_speed": summary.speed,
     "summary_accuracy": summary.accuracy,
+    "summary_peers": summary.peers,
     "summary_learning": summary.learning,
     "summary_limits": summary.limits,
+    "peers_camera": lambda: peers.table(load("peers"), peers.CAMERA),
+    "peers_lidar": lambda: peers.table(load("peers"), peers.LIDAR),
+    "peers_recordings": lambda: peers.by_recording(load("peers")),
+    "peers_settings": lambda: peers.settings(load("peers")),
     "accuracy": _accuracy,
     "features": _features,
     **_in_parts(_made_by(changes.tables, "changes"), "changes", "changes_aging", "changes_left"),

@@ -7,6 +7,7 @@ from statistics import mean
 from typing import Any
 
 import training
+from benchmarks.peers import report
 from benchmarks.speed.update import tables
 from benchmarks.speed.workload import BPEARL, SENSORS
 from docs.results import GPU, SPEED, load
@@ -42,6 +43,28 @@ def speed() -> str:
     span = f"{min(ratios):.1f} to {max(ratios):.1f} times theirs"
     rows.append([_processor(filters), "filters of 1 to 256 maps", span, "OpenCV, SciPy"])
     return markdown_table(["on", "what", "torchelev", "beside it"], rows)
+
+
+PEER_SCORES = {  # the columns of the peers' table that are summed up
+    "rmse": "error of the ground, RMSE [cm]",
+    "rmse_at_steps": "the same at steps [cm]",
+    "reaction_scans": "scans until a change shows in the map",
+    "p50_ms": "median time of a depth image [ms]",
+}
+
+
+def peers() -> str:
+    """Tabulate torchelev beside the best and the worst of the other maps, on recordings of a depth camera."""
+    result = load("peers")
+    (_, own), *others = report.average(result, report.CAMERA).items()
+    columns, rows = {column.key: column for column in report.COLUMNS}, []
+    for key, title in PEER_SCORES.items():
+        order = sorted((values[key], name) for name, values in others if key in values)
+        cells = [report.cell_text(columns[key], own[key])]
+        for value, name in (order[0], order[-1]):
+            cells.append(f"{report.cell_text(columns[key], value)}: {result['peers'][name]['title']}")
+        rows.append([title, *cells])
+    return markdown_table(["", "torchelev", "best other map", "worst other map"], rows)
 
 
 def _processor(result: dict[str, Any]) -> str:

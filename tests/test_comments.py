@@ -173,5 +173,5 @@ def test_stale_files_and_names_are_found():
 
 
 def test_names_of_all_kinds_are_known():
-    text = "`ElevationMap.layer`, `T_map_base`, `fill='completed'`, `with`, `torch.func.vjp`, ``io.clouds``, `amax`"
+    text = "`ElevationMap.layer`, `T_map_base`, `fill='inpaint'`, `with`, `torch.func.vjp`, ``io.clouds``, `amax`"
     assert missing_names(text) == [] and missing_files("grid.py, site/tiles.py and `/absent`") == []

@@ -1,9 +1,12 @@
 """The README and the pages of benchmarks: their tables are those of the results, and the README's code runs."""
 
 import pytest
+import yaml
+from click.testing import CliRunner
 
 from docs.readme_tables import PAGES, ROOT, TABLES, empty_tables, has_result, names_of_tables, with_tables
 from tests.docs.markdown import code_blocks, run_blocks
+from torchelev.app.cli import main
 
 README = ROOT / "README.md"
 
@@ -54,10 +57,33 @@ def test_writes_a_table_in_place_of_an_old_one():
 
 
 @pytest.mark.slow(10)
-def test_its_python_runs_from_the_first_block_to_the_last():
+def test_its_python_runs_from_the_first_block_to_the_last(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     blocks = [block for block in code_blocks(README.read_text()) if block.language == "python"]
     assert len(blocks) >= 3
     run_blocks(README, blocks)
+    assert {path.name for path in tmp_path.iterdir()} == {"stairs.png"}
+
+
+@pytest.mark.slow(40)
+def test_its_commands_run_in_order(tmp_path, monkeypatch):
+    """Those that end by themselves; `view` opens a page, and is tested elsewhere."""
+    monkeypatch.chdir(tmp_path)
+    blocks = [block for block in code_blocks(README.read_text()) if block.language == "bash"]
+    lines = [line.split("#")[0].split() for block in blocks for line in block.code.splitlines()]
+    commands = [words[1:] for words in lines if words[:1] == ["torchelev"] and words[1] != "view"]
+    assert [words[0] for words in commands] == ["demo", "map", "plan"]
+    for words in commands:
+        done = CliRunner().invoke(main, words)
+        assert done.exit_code == 0, f"torchelev {' '.join(words)}: {done.output}"
+    assert {"drive.mcap", "map.npz", "map.png"} <= {path.name for path in tmp_path.iterdir()}
+
+
+def test_it_is_short_and_cites_this_version():
+    assert len(README.read_text().splitlines()) <= 180
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert f'\nversion = "{citation["version"]}"\n' in (ROOT / "pyproject.toml").read_text()
+    assert citation["license"] == "MIT" and "2204.12876" in str(citation["references"])
 
 
 def test_the_table_of_stacks_is_the_one_of_the_docs():

@@ -46,10 +46,14 @@ from torchelev.stages.measure.stage import find_own, measure, time_step
 from torchelev.state import MapState, Measurement, map_layers
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
     from jaxtyping import Bool, Float
 
     from torchelev.traversability.net import TraversabilityNet
     from torchelev.traversability.weight_file import Weights
+    from torchelev.viz.live import LiveView
 
 
 class ElevationMap(RestartableMap):
@@ -340,6 +344,39 @@ class ElevationMap(RestartableMap):
         from torchelev.diagnosis.causes import diagnose  # updates do not need it
 
         return diagnose(self.cfg, self.state, self._history)
+
+    # Pictures: the only imports of what draws, so that one line is enough ---------------------------------------------
+
+    def save_png(self, path: str | Path, layers: Sequence[str] | None = None, env: int = 0) -> None:
+        """Draw one environment with axes in metres of the map frame. Needs `torchelev[io]`.
+
+        Args:
+            path: of the picture to write, a .png.
+            layers: names of `layers`, a panel for each; None: what `torchelev map` draws.
+            env: the environment.
+
+        Raises:
+            ValueError: if there is no such environment or layer, or the path is no PNG's.
+            WriteError: if the picture cannot be written.
+        """
+        from torchelev.viz.map_picture import save_map_picture
+
+        save_map_picture(path, self, layers, env)
+
+    def show(self, T_map_base: Any = None, *, block: bool | None = None, **options: Any) -> LiveView:
+        """Open a page that shows the map in 3D, and print its address. Needs `torchelev[view]`.
+
+        Args:
+            T_map_base: poses of the robots (B, 4, 4), to draw them; None: no robots.
+            block: wait until Ctrl-C, then close the page. None: in a script yes, in an interactive session no.
+            options: of `torchelev.viz.live.LiveView`, such as `port`.
+
+        Returns:
+            The view: its `show` shows the map anew after further updates, `close` ends it.
+        """
+        from torchelev.viz.live import open_view
+
+        return open_view(self, T_map_base, block=block, **options)
 
     def _forget_derived(self) -> None:
         super()._forget_derived()

@@ -138,11 +138,6 @@ def forget_cells(state: MapState, cells: Bool[Tensor, "B H W"]) -> MapState:
     return state._replace(**blank)  # type: ignore[arg-type]
 
 
-def partial_state(**layers: Tensor) -> MapState:
-    """Return a state of some layers, for functions that read no others."""
-    return MapState(**(dict.fromkeys(MapState._fields) | layers))  # type: ignore[arg-type]
-
-
 def map_layers(function: Callable[..., Tensor], *states: MapState) -> MapState:
     """Apply a function to each tensor of a state, or to the same tensor of several states."""
     layers = {n: function(*(getattr(state, n) for state in states)) for n in MapState._fields[:-1]}

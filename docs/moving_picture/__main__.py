@@ -1,4 +1,4 @@
-"""Draw docs/pictures/walk.webp, the moving picture, and walk.png, its still.
+"""Draw docs/pictures/walk.webp, the moving picture.
 
     python -m docs.moving_picture          # about five minutes on two cores
 
@@ -10,27 +10,22 @@ from __future__ import annotations
 from pathlib import Path
 
 import click
-from PIL import Image
 from tqdm import tqdm
 
 from docs.moving_picture.film import frames, save_film
-from torchelev.files.output_files import atomic_file
 
 PICTURES = Path(__file__).parents[1] / "pictures"
-_STILL = 0.72  # of the film
+_FIRST = 0.72  # of the film: the frame that it begins with
 
 
 @click.command(help=__doc__)
 @click.option("--out", type=click.Path(path_type=Path), default=PICTURES, help="Output folder.")
 @click.option("--seconds", type=float, default=None, help="Only the beginning, for a try.")
 def main(out: Path, seconds: float | None) -> None:
-    """Render the film and its still."""
+    """Render the film."""
     out.mkdir(parents=True, exist_ok=True)
     images = list(tqdm(frames(seconds), unit="frame", disable=None))
-    save_film(images, out / "walk.webp")
-    with atomic_file(out / "walk.png") as file:
-        still = images[round(_STILL * (len(images) - 1))]
-        still.quantize(256, dither=Image.Dither.NONE).save(file, format="png", optimize=True)
+    save_film(images, out / "walk.webp", round(_FIRST * (len(images) - 1)))
 
 
 if __name__ == "__main__":

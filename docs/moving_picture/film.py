@@ -23,8 +23,9 @@ FRAMES_PER_SECOND = 15
 STAGE_SIZE, TILE, GAP = (760, 560), 96, 6  # [pixels]
 SIZE = (STAGE_SIZE[0] + 4 * (TILE + GAP) + 24, STAGE_SIZE[1])
 FILM_SIZE = (936, 440)  # [pixels] of the file
+_EVERY = 2  # of the frames goes into the file, which stays small
 _HOLD, _FADE = 1.0, 0.4  # [s] at the end
-_KEY_FRAMES = {"kmin": 3, "kmax": 20}  # few enough for 4 MB, enough that no trace of the robot stays
+_KEY_FRAMES = {"kmin": 3, "kmax": 20}  # few enough for a small file, enough that no trace of the robot stays
 _TEXT, _FONT = "#2b2f36", File(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf")
 _TOP = 56  # [pixels] above the tiles
 
@@ -102,18 +103,22 @@ def _font(size: int) -> ImageFont.FreeTypeFont:
     return ImageFont.truetype(str(_FONT), size)
 
 
-def save_film(images: Sequence[Image.Image], path: File, max_bytes: int = 4_000_000) -> None:
-    """Write an endless loop as WebP, in the best quality below `max_bytes`. The last frame stays, then fades."""
-    images = [image.resize(FILM_SIZE, Image.Resampling.LANCZOS) for image in images]
+def save_film(images: Sequence[Image.Image], path: File, first: int = 0, max_bytes: int = 1_200_000) -> None:
+    """Write an endless loop as WebP, in the best quality below `max_bytes`, or the least one.
+
+    It begins at the frame `first`, as pages show the first one while they load. The last frame stays, then fades.
+    """
+    first //= _EVERY
+    images = [image.resize(FILM_SIZE, Image.Resampling.LANCZOS) for image in images[::_EVERY]]
     blank = Image.new("RGB", FILM_SIZE, BACKGROUND)
-    steps = round(_FADE * FRAMES_PER_SECOND)
+    steps, dt = round(_FADE * FRAMES_PER_SECOND / _EVERY), 1000 * _EVERY / FRAMES_PER_SECOND
     faded = [Image.blend(images[-1], blank, k / steps) for k in range(1, steps + 1)]
-    dt = 1000 / FRAMES_PER_SECOND
     durations = [round(dt)] * (len(images) - 1) + [round(1000 * _HOLD)] + [round(dt)] * steps
-    for quality in (80, 75, 70, 65, 60, 50, 40):
+    images, durations = [*images[first:], *faded, *images[:first]], [*durations[first:], *durations[:first]]
+    for quality in (80, 70, 60, 50, 40, 30, 20):
         data = io.BytesIO()
         images[0].save(
-            data, format="webp", save_all=True, append_images=[*images[1:], *faded], duration=durations, loop=0,
+            data, format="webp", save_all=True, append_images=images[1:], duration=durations, loop=0,
             quality=quality, method=4, **_KEY_FRAMES,
         )  # fmt: skip
         if data.tell() <= max_bytes:

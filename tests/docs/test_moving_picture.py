@@ -85,7 +85,7 @@ def test_a_film_of_few_frames(tmp_path, small):
     assert 0.02 < colorful.mean() < 0.8, "map, robot and view cover a part of the stage"
     film.save_film(images, tmp_path / "walk.webp")
     loop = Image.open(tmp_path / "walk.webp")
-    assert loop.size == film.FILM_SIZE and loop.n_frames == 3 + 6 and loop.info["loop"] == 0
+    assert loop.size == film.FILM_SIZE and loop.n_frames == 2 + 3 and loop.info["loop"] == 0
 
 
 def test_steps_have_vertical_faces_and_slopes_are_smooth():

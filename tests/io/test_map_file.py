@@ -242,12 +242,15 @@ def test_reads_a_file_of_before_without_its_predictions(path):
     before = load_map(path).state
     predicted = before.validity & (torch.rand(before.validity.shape, generator=torch.Generator().manual_seed(0)) < 0.5)
     config = json.loads(str(np.load(path)["header"]))["config"]
-    rewrite(path, support=torch.where(predicted, -1.0, before.support).numpy())
+    bounds = {"upper_bound": before.elevation.numpy(), "bounded": (predicted | before.bounded).numpy()}
+    rewrite(path, support=torch.where(predicted, -1.0, before.support).numpy(), **bounds)
+    before = load_map(path).state
     rewrite_header(path, config={**config, "completion": {"weights": None, "when": "read", "write_back": True}})
     state = load_map(path).state
     assert predicted.any() and torch.equal(state.validity, before.validity & ~predicted)
     assert torch.equal(state.elevation[state.validity], before.elevation[state.validity])
     assert (state.support >= 0).all() and not state.elevation[predicted].any()
+    assert torch.equal(state.bounded, before.bounded) and torch.equal(state.upper_bound, before.upper_bound)
 
 
 @pytest.mark.parametrize("env_ids", [[2], [-1], [], [[0]], [0.0], torch.tensor([True, False])])

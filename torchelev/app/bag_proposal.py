@@ -12,6 +12,7 @@ from torchelev.io.bags.colors import field_names
 from torchelev.io.bags.poses.clocks import ClockError
 from torchelev.io.bags.poses.reading import ODOMETRY, POSE, TRANSFORMS
 from torchelev.io.bags.scans import CLOUDS, IMAGES, LIDARS
+from torchelev.io.bags.topics import depth_topics
 from torchelev.io.point_colors import color_fields
 
 _LABELS = re.compile("semantic|label|segment", re.IGNORECASE)
@@ -72,8 +73,7 @@ def _requests(bag: Bag) -> Iterator[BagRequest]:
 def _choose_sensor(topics: list[Topic]) -> BagRequest:
     names = {kind: [topic.name for topic in topics if topic.type == kind and topic.num] for kind in CLOUDS}
     clouds = next((found for found in names.values() if found), [])
-    depths = [topic.name for topic in topics if topic.type in IMAGES and "depth" in topic.name]
-    return BagRequest(clouds=clouds[:1], depths=[] if clouds else depths[:1])
+    return BagRequest(clouds=clouds[:1], depths=[] if clouds else depth_topics(topics)[:1])
 
 
 def _open(bag: Bag, request: BagRequest) -> tuple[BagRequest, BagRecording]:

@@ -100,9 +100,14 @@ class DemoWalk:
     Args:
         seconds: simulated time [s] to walk; None: the whole course, about 30 s.
         camera: what the robot sees with.
+
+    Raises:
+        ValueError: the time is not positive.
     """
 
     def __init__(self, seconds: float | None = None, camera: DepthCamera = CAMERA) -> None:
+        if seconds is not None:
+            require(0 < seconds < math.inf, "seconds", "must be positive", seconds, "leave it out for the whole course")
         self._camera = camera
         torch.manual_seed(0)
         self.scene = make_course()
@@ -114,10 +119,14 @@ class DemoWalk:
     def __len__(self) -> int:
         return min(len(self.path.times), self._num_scans)
 
-    def __iter__(self) -> Iterator[DemoScan]:
+    def observe(self) -> Iterator[DemoScan]:
+        """Yield the scans without fusing them."""
         generator = torch.Generator().manual_seed(0)
         for k in range(len(self)):
-            scan = _observe(self.scene, self.path, k, generator, self._camera)
+            yield _observe(self.scene, self.path, k, generator, self._camera)
+
+    def __iter__(self) -> Iterator[DemoScan]:
+        for scan in self.observe():
             self.update_ms.append(_fuse(self.emap, scan))
             yield scan
 
@@ -140,8 +149,6 @@ def run_demo(
         WriteError: the picture cannot be written; raised before the walk, as is ValueError.
         ValueError: the suffix is not a picture's, or the time is not positive.
     """
-    if seconds is not None:
-        require(0 < seconds < math.inf, "seconds", "must be positive", seconds, "leave it out for the whole course")
     from torchelev.viz.style import require_picture
 
     require_picture(out)

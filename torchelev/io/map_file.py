@@ -95,8 +95,9 @@ def load_map(
     state = _state(path, arrays, emap.state, ids, header["version"])
     if header["version"] < VERSION:
         state = rate(state, emap.cfg, None if emap.head is None else emap.head.weights)
-    if predicts:  # such files mark the cells that were filled by their support
-        state = forget_cells(state, state.validity & (state.support < 0))
+    if predicts:  # such files mark cells that were filled by their support, and kept their bounds
+        measured = forget_cells(state, state.validity & (state.support < 0))
+        state = measured._replace(upper_bound=state.upper_bound, bounded=state.bounded)
     emap.load_state(state)
     B = len(arrays["corner"])
     for name, value in _followers(emap).items():

@@ -128,16 +128,7 @@ template <class Result, class Value> inline Result gather_as(const Value* values
 
 inline Lanes gather(const float* values, Flags index) { return gather_as<Lanes>(values, index); }
 inline Flags gather(const int32_t* values, Flags index) { return gather_as<Flags>(values, index); }
-inline Flags gather(const int16_t* values, Flags index) { return gather_as<Flags>(values, index); }
 inline Flags gather(const uint8_t* values, Flags index) { return gather_as<Flags>(values, index); }
-
-// Values that lie side by side, as `gather` returns them.
-template <class Value> auto load_as(const Value* values) {
-    typedef Value Values __attribute__((vector_size(sizeof(Value) * LANES)));
-    Values found;
-    std::memcpy(&found, values, sizeof found);
-    return __builtin_convertvector(found, decltype(gather(values, Flags{})));
-}
 
 // Call `work(k, count)` for the vectors of first to last; a count that is known to the compiler for all but the last.
 template <class Work> inline void for_vectors(int64_t first, int64_t last, const Work& work) {
@@ -176,31 +167,6 @@ inline bool any_set(const uint8_t* bytes, int64_t count) {
     return some;
 }
 
-// Natural logarithm of positive normal numbers, by the polynomial of Cephes' logf: 1 unit in the last place.
-inline Lanes log(Lanes x) {
-    const Flags exponent = ((Flags)x - 0x3f3504f3) >> 23;  // such that the mantissa is in sqrt(1/2) to sqrt(2)
-    const Lanes m = (Lanes)((Flags)x - (exponent << 23)) - 1, e = __builtin_convertvector(exponent, Lanes);
-    Lanes y = splat(7.0376836292e-2f);
-    for (float c : {-1.1514610310e-1f, 1.1676998740e-1f, -1.2420140846e-1f, 1.4249322787e-1f, -1.6668057665e-1f,
-                    2.0000714765e-1f, -2.4999993993e-1f, 3.3333331174e-1f})
-        y = y * m + c;
-    y = y * m * m * m - e * 2.12194440e-4f - 0.5f * m * m;
-    return m + y + e * 0.693359375f;
-}
-
-// Exponential, by the polynomial of Cephes' expf; arguments beyond +-87 are clamped.
-inline Lanes exp(Lanes x) {
-    x = clamp(x, -87, 87);
-    const float whole = 12582912.0f;  // adding it rounds to integers
-    const Lanes n = (x * 1.44269504088896341f + whole) - whole;
-    x = x - n * 0.693359375f + n * 2.12194440e-4f;
-    Lanes y = splat(1.9875691500e-4f);
-    for (float c : {1.3981999507e-3f, 8.3334519073e-3f, 4.1665795894e-2f, 1.6666665459e-1f, 5.0000001201e-1f})
-        y = y * x + c;
-    y = y * x * x + x + 1;
-    return (Lanes)((Flags)y + (__builtin_convertvector(n, Flags) << 23));
-}
-
 inline Lanes arctan_of_small(Lanes x) {
     const Lanes z = x * x;
     Lanes p = splat(8.05374449538e-2f);
@@ -216,45 +182,4 @@ inline Lanes arctan(Lanes x) {
     const Lanes below = pick(is_large, x, pick(is_middle, x + 1, splat(1)));
     const Lanes start = pick(is_large, splat(1.5707963268f), pick(is_middle, splat(0.7853981634f), splat(0)));
     return start + arctan_of_small(above / below);
-}
-
-inline Lanes tanh(Lanes x) { return 1 - 2 / (exp(2 * x) + 1); }
-inline Lanes sigmoid(Lanes x) { return 1 / (1 + exp(-x)); }
-
-// sign(x) log(1 + |x| / scale)
-inline Lanes squash(Lanes x, float scale) {
-    const Lanes y = log(1 + absolute(x) * (1 / scale));
-    return pick(x < 0, -y, y);
-}
-
-// y = w x + b for a matrix (OUT, IN), row by row, and COLUMNS columns of x; without b: y += w x.
-template <int OUT, int IN, int COLUMNS, bool IS_HIDDEN = false>
-inline void affine(const float* w, const float* b, const Lanes (*x)[COLUMNS], Lanes (*y)[COLUMNS]) {
-    constexpr int ACROSS = COLUMNS % 2 == 0 ? 2 : 1;  // the sums of a tile stay in registers
-    constexpr int DOWN = OUT % 8 == 0 && ACROSS == 1 ? 8 : OUT % 4 == 0 ? 4 : OUT % 2 == 0 ? 2 : 1;
-    for (int row = 0; row < OUT; row += DOWN)
-        for (int column = 0; column < COLUMNS; column += ACROSS) {
-            Lanes sums[DOWN][ACROSS];
-#pragma GCC unroll 8
-            for (int k = 0; k < DOWN; k++)
-#pragma GCC unroll 2
-                for (int c = 0; c < ACROSS; c++) sums[k][c] = b ? splat(b[row + k]) : y[row + k][column + c];
-#pragma GCC unroll 2
-            for (int in = 0; in < IN; in++)
-#pragma GCC unroll 8
-                for (int k = 0; k < DOWN; k++)
-#pragma GCC unroll 2
-                    for (int c = 0; c < ACROSS; c++) sums[k][c] += w[(row + k) * IN + in] * x[in][column + c];
-#pragma GCC unroll 8
-            for (int k = 0; k < DOWN; k++)
-#pragma GCC unroll 2
-                for (int c = 0; c < ACROSS; c++)
-                    y[row + k][column + c] = IS_HIDDEN ? larger(sums[k][c], splat(0)) : sums[k][c];
-        }
-}
-
-// y = max(w x + b, 0)
-template <int OUT, int IN, int COLUMNS>
-inline void hidden(const float* w, const float* b, const Lanes (*x)[COLUMNS], Lanes (*y)[COLUMNS]) {
-    affine<OUT, IN, COLUMNS, true>(w, b, x, y);
 }

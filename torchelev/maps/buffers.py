@@ -115,8 +115,8 @@ class MapBuffers(nn.Module):
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         """Load a checkpoint, or refuse one of another config before anything changes, naming the settings."""
         extra = state_dict.get(f"{prefix}_extra_state")
-        # Filters hold no state, and weights come from this checkpoint whatever file they were read from.
-        ignored = ("filters", "traversability.weights")
+        # Filters hold no state, weights come from this checkpoint, and only older versions had a completion.
+        ignored = ("filters", "traversability.weights", "completion")
         fields = differing_fields(self.cfg.to_dict(), extra["config"]) if extra else []
         fields = [name for name in fields if not name.startswith(ignored)]
         hint = "build the map with ElevationMapConfig.from_dict(checkpoint['_extra_state']['config'])"

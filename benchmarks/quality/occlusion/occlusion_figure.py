@@ -10,6 +10,7 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.image import AxesImage
 
+from benchmarks.quality.occlusion.rules import IMPASSABLE, UPPER_BOUND
 from benchmarks.quality.occlusion.scenes import Case
 from benchmarks.quality.occlusion.walks import GRID
 from torchelev import ElevationMap
@@ -19,8 +20,7 @@ from torchelev.viz.style import ROBOT_COLOR, draw_cells, make_figure, save, styl
 
 _SPAN = (-1.7, 2.6)  # [m] drawn range of x
 EYE = 0.8  # [m] height of the camera
-_RULE = "upper bound"
-_SHOWN = (_RULE, "in-painted by diffusion", "in-painted by the minimum", "unknown is impassable")
+_SHOWN = (UPPER_BOUND, "in-painted by diffusion", "in-painted by the minimum", IMPASSABLE)
 Scene = tuple[Case, ElevationMap, float, dict[str, Path]]  # with the robot's x [m] and the path of each rule
 
 
@@ -31,7 +31,7 @@ def draw(out: str | File, scenes: Sequence[Scene]) -> None:
     axes = figure.subplots(2, len(scenes), sharex=True, squeeze=False, height_ratios=(1.25, 1))
     for column, (case, emap, x, plans) in zip(axes.T, scenes, strict=True):
         _section(column[0], case, emap, x, plans)
-        image = _cost(column[1], emap, x, case.goal, plans[_RULE])
+        image = _cost(column[1], emap, x, case.goal, plans[UPPER_BOUND])
     figure.colorbar(image, ax=axes[1], pad=0.01, label="cost of each metre [1 on flat ground]")
     axes[0, 0].set_ylabel("z [m]")
     axes[1, 0].set_ylabel("y [m]")

@@ -13,8 +13,8 @@ from torchelev.planning.planner import Path, plan
 from torchelev.planning.traversal_cost import TraversalCostConfig
 from torchelev.state import MapState
 
-_IMPASSABLE = TraversalCostConfig(cross_unknown=False)
-UPPER_BOUND, TRUTH = "upper bound", "true ground"
+_CAUTIOUS = TraversalCostConfig(cross_unknown=False)
+UPPER_BOUND, IMPASSABLE, TRUTH = "upper bound", "unknown is impassable", "true ground"
 INPAINTED = {
     "in-painted by diffusion": "inpaint_diffusion",
     "in-painted by the minimum": "inpaint_minimum",
@@ -23,7 +23,7 @@ INPAINTED = {
     "in-painted by Navier-Stokes": "inpaint_navier_stokes",
 }
 PREDICTED = (UPPER_BOUND, *INPAINTED)  # rules that predict a height
-RULES = (*PREDICTED, "unknown is impassable", TRUTH)
+RULES = (*PREDICTED, IMPASSABLE, TRUTH)
 
 
 def predict(emap: ElevationMap, rule: str) -> tuple[Tensor, Tensor]:
@@ -44,7 +44,7 @@ def decide(emap: ElevationMap, x: float, case: Case) -> dict[str, Path]:
     """Plan a path by each rule from (x, 0) to the goal behind the edge, with the default settings of the planner."""
     ends = torch.tensor([[x, 0.0]]), torch.tensor([[case.goal, 0.0]])
     true = true_heights(emap, case)
-    paths = {UPPER_BOUND: plan(emap, *ends), "unknown is impassable": plan(emap, *ends, _IMPASSABLE)}
+    paths = {UPPER_BOUND: plan(emap, *ends), IMPASSABLE: plan(emap, *ends, _CAUTIOUS)}
     paths |= {rule: plan(emap, *ends, state=_rated(emap, *predict(emap, rule))) for rule in INPAINTED}
     paths[TRUTH] = plan(emap, *ends, state=_rated(emap, true, torch.ones_like(true, dtype=torch.bool)))
     return {rule: paths[rule] for rule in RULES}

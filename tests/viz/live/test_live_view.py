@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 import threading
 import time
 
@@ -123,3 +124,17 @@ def test_a_closed_view_shows_nothing(emap, port):
     view = LiveView(emap, port=port)
     view.close()
     assert view.show() is False
+
+
+@pytest.mark.parametrize(
+    "block, interactive, waits", [(None, False, 1), (None, True, 0), (True, True, 1), (False, False, 0)]
+)
+def test_a_map_shows_itself(emap, port, monkeypatch, block, interactive, waits):
+    """A script waits at the page, an interactive session goes on."""
+    waited = []
+    monkeypatch.setattr(LiveView, "wait", lambda view: waited.append(view))
+    monkeypatch.delitem(sys.modules, "ipykernel", raising=False)
+    monkeypatch.setattr(sys, "ps1", ">>> ", raising=False) if interactive else monkeypatch.delattr(sys, "ps1", False)
+    with emap.show(pose(num_envs=3), block=block, port=port) as view:
+        wait_for(lambda: view.num_drawn == 1)
+        assert len(waited) == waits and view.page.url.endswith(str(port))

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from torchelev.app.mapping.report import choose_panels
 from torchelev.files.output_files import require_writable
 from torchelev.io import MappingRun
 
@@ -104,6 +103,7 @@ def _write_to_fallback(name: str, write: Callable[[Path], object]) -> Path | Non
 def _save_picture(path: Path, run: MappingRun, title: str) -> None:
     """Draw the main layers, those of filters, and the sensor's path."""
     from torchelev.io.export import take
+    from torchelev.viz.map_picture import choose_panels
     from torchelev.viz.plot import save_layers
 
     saved = take(run.emap)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,8 +12,6 @@ from torchelev.io import MappingRun
 
 if TYPE_CHECKING:
     from torchelev.elevation_map import ElevationMap
-    from torchelev.io.export import SavedMap
-    from torchelev.viz.plot import Panel
 
 _MIN_USED = 0.01  # of the finite points; with fewer, the map does not show the recorded place
 
@@ -86,44 +84,3 @@ def suggest_options(run: MappingRun, fixed: bool, knows_base: bool) -> list[str]
             "note      overlap clearance is off; give --extrinsics (or --sensor-height for a folder) to enable it"
         )
     return notes
-
-
-def choose_panels(saved: SavedMap, filters: Sequence[str] = ()) -> list[Panel]:
-    """Return panels of the main layers, colours and classes, and filters; heights share one colour scale."""
-    from torchelev.viz.plot import Panel
-    from torchelev.viz.style import DEVIATIONS, RATINGS
-
-    layers = saved.layers
-    elevation, traversability = layers["elevation"], layers["traversability"]
-    known = elevation[np.isfinite(elevation)]
-    low, high = (float(v) for v in np.percentile(known, [1, 99])) if known.size else (None, None)
-    return [
-        Panel(title="elevation", values=elevation, unit="m", vmin=low, vmax=high),
-        Panel(title="standard deviation", values=np.sqrt(layers["variance"]), unit="m", cmap=DEVIATIONS, vmin=0.0),
-        Panel(title="traversability", values=traversability, unit="0 to 1", cmap=RATINGS, vmin=0.0, vmax=1.0),
-        Panel(title="upper bound", values=layers["upper_bound"], unit="m", vmin=low, vmax=high),
-        *_clearance_panel(saved),
-        *_channel_panels(saved),
-        *(Panel(title=name, values=layers[name]) for name in filters),
-    ]
-
-
-def _clearance_panel(saved: SavedMap) -> Iterator[Panel]:
-    """Yield a panel of the clearance, of a map with levels."""
-    from torchelev.viz.plot import Panel
-
-    if "clearance" in saved.layers:
-        values = np.where(np.isinf(saved.layers["clearance"]), np.nan, saved.layers["clearance"])
-        yield Panel(title="clearance below ceilings", values=values, unit="m")
-
-
-def _channel_panels(saved: SavedMap) -> Iterator[Panel]:
-    """Yield a panel of true colours for each channel of colours, and of the most probable class for each of classes."""
-    from torchelev.viz.channels import channel_colors, class_legend, shown_channels
-    from torchelev.viz.plot import Panel
-
-    for name, cfg in shown_channels(saved.config, saved.layers).items():
-        parts = np.stack([saved.layers[part] for part in cfg.components(name)])
-        colors, is_color = channel_colors(cfg, parts), cfg.is_color
-        legend = {} if is_color else class_legend(cfg, parts)
-        yield Panel(title=name if is_color else f"most probable {name}", values=colors, legend=legend)

@@ -22,7 +22,7 @@ from torchelev.io.bags.poses.reading import time_of
 from torchelev.io.bags.poses.transforms import FrameError
 from torchelev.io.bags.poses.within_scan import hold_still
 from torchelev.io.bags.scans import Scan, clean, read_scan
-from torchelev.io.bags.topics import BagRequest, choose_topics
+from torchelev.io.bags.topics import BagRequest, choose_topics, find_depth
 from torchelev.io.errors import RecordingError
 from torchelev.io.folders.recording import Frame
 from torchelev.io.labels import LabelImage
@@ -49,6 +49,7 @@ class BagRecording:
 
     def __init__(self, bag: Bag, request: BagRequest, show: Any = iter) -> None:
         self._bag, types = bag, {topic.name: topic for topic in bag.topics}
+        request = find_depth(types, request)
         self.topics = choose_topics(bag, types, request)
         self._num = sum(types[name].num for name in self.topics)
         self._cameras = find_cameras(bag, types, request)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -38,6 +38,20 @@ class BagRequest(NamedTuple):
     semantic: str | None = None  #: topic of images of class labels
     semantic_info: str | None = None  #: topic of its CameraInfo; None: the one beside it
     classes: Sequence[str] = ()  #: names of the labels 0, 1, ...; (): as many as there are
+
+
+def depth_topics(topics: Iterable[Topic]) -> list[str]:
+    """Return the names of topics of images whose names say that these are depth images."""
+    return [topic.name for topic in topics if topic.type in IMAGES and "depth" in topic.name]
+
+
+def find_depth(types: dict[str, Topic], request: BagRequest) -> BagRequest:
+    """Return the request, for the only topic of depth images where a bag has no clouds and none was named."""
+    depths = depth_topics(types.values())
+    has_clouds = any(topic.type in CLOUDS for topic in types.values())
+    if request.clouds or request.depths or has_clouds or len(depths) != 1:
+        return request
+    return request._replace(depths=depths)
 
 
 def choose_topics(bag: Bag, types: dict[str, Topic], request: BagRequest) -> list[str]:

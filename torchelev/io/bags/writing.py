@@ -67,7 +67,10 @@ class BagWriter:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *exception: object) -> None:
-        self.close()
+        if kind is None:
+            self.close()
+        else:
+            self.discard()
 
     def make(self, type_: str, /, **fields: Any) -> Any:
         """Return a message of a type such as "geometry_msgs/msg/Point"."""
@@ -100,6 +103,13 @@ class BagWriter:
             with self._full_disk_named():
                 self._bag.close()
             self._written().replace(self.path)
+        finally:
+            shutil.rmtree(self._folder, ignore_errors=True)
+
+    def discard(self) -> None:
+        """Leave the path as it was, as after an error in the `with` statement."""
+        try:
+            self._bag.close()
         finally:
             shutil.rmtree(self._folder, ignore_errors=True)
 

@@ -41,19 +41,6 @@ inline int32_t* block_memory() {
     return memory;
 }
 
-// The sum of what a block's threads before this one bring; all must call it, with memory for a number of each.
-inline int32_t sum_before(int32_t value, int32_t* sums) {
-    const int32_t own = threadIdx.x;
-    sums[own] = value;
-    for (int32_t step = 1; step < blockDim.x; step *= 2) {
-        __syncthreads();
-        const int32_t other = own >= step ? sums[own - step] : 0;
-        __syncthreads();
-        sums[own] += other;
-    }
-    return sums[own] - value;
-}
-
 // The sum of what a block's threads bring, the same for all; all must call it, with memory for a number of each warp.
 template <class Value> inline Value sum_of_block(Value value, Value* sums) {
     for (int step = warpSize / 2; step > 0; step /= 2) value += __shfl_xor_sync(0xffffffff, value, step);

@@ -61,6 +61,7 @@ Config::Config(const std::string& text, const std::string& where) {
 void Config::read_group(const Json& group, const std::string& prefix) {
     for (const auto& [name, value] : group.members) {
         if (prefix.empty() && (name == VERSION_NAME || name == SCHEMA_NAME)) continue;
+        if (prefix.empty() && name == "completion" && value.kind == Json::NUL) continue;  // of old files
         const size_t k = find(prefix + name);
         const std::string parent = prefix.empty() ? "" : prefix.substr(0, prefix.size() - 1);
         REQUIRE(k < NUMBER_OF_SETTINGS, "config." + prefix + name, "is not a setting", "'" + name + "'",

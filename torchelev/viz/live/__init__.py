@@ -3,9 +3,9 @@
 Needs ``pip install 'torchelev[view]'``. `torchelev view` in `torchelev.app` starts it for files.
 """
 
-from torchelev.viz.live.live_view import LiveView
+from torchelev.viz.live.live_view import LiveView, open_view
 from torchelev.viz.live.page import Page
 from torchelev.viz.live.player import Player
 from torchelev.viz.live.snapshot import Snapshot, take_snapshot
 
-__all__ = ["LiveView", "Page", "Player", "Snapshot", "take_snapshot"]
+__all__ = ["LiveView", "Page", "Player", "Snapshot", "open_view", "take_snapshot"]

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from torchelev.io.export import SavedMap
 
 _DIRECTION = np.array([-0.35, -0.5, 0.5])  # from the map's centre to the camera, in lengths of the map
+_RIGHT = np.array([-_DIRECTION[1], _DIRECTION[0], 0.0]) / np.hypot(*_DIRECTION[:2])  # of that camera
+_ASIDE = 0.16  # [lengths of the map] to the left of the middle, as the panel covers the right of the page
 
 
 class Camera:
@@ -34,7 +36,9 @@ class Camera:
         heights = saved.layers["elevation"]
         ground = float(np.nanmedian(heights)) if np.isfinite(heights).any() else float(saved.center[2])
         target = np.append(saved.center[:2], ground) - origin
-        position = target + _DIRECTION * max(heights.shape) * saved.resolution
+        length = max(heights.shape) * saved.resolution
+        target = target + _ASIDE * length * _RIGHT
+        position = target + _DIRECTION * length
         cameras = [self._server.initial_camera]
         if not self._has_looked:
             cameras += [client.camera for client in self._server.get_clients().values()]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import threading
 import time
 from types import TracebackType
@@ -171,3 +172,17 @@ class LiveView:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def open_view(emap: ElevationMap, T_map_base: Any = None, *, block: bool | None = None, **options: Any) -> LiveView:
+    """Open a view of a map as it is; see `ElevationMap.show`."""
+    view = LiveView(emap, **options)
+    try:
+        view.show(T_map_base)
+    except BaseException:
+        view.close()
+        raise
+    is_interactive = hasattr(sys, "ps1") or bool(sys.flags.interactive) or "ipykernel" in sys.modules
+    if block or (block is None and not is_interactive):
+        view.wait()
+    return view

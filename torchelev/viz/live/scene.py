@@ -13,7 +13,7 @@ from torchelev.planes import segment
 from torchelev.viz.live.snapshot import BOUND, CEILING, CLOUD, FRAMES, PATH, PLAN, PLANES, SCAN, Snapshot
 from torchelev.viz.live.surface import bound_sheet, ceiling_sheet, surface
 
-_COLORS = {BOUND: (120, 150, 190), CEILING: (150, 120, 170), CLOUD: (230, 60, 60), SCAN: (240, 228, 66)}
+_COLORS = {BOUND: (70, 115, 190), CEILING: (150, 120, 170), CLOUD: (230, 60, 60), SCAN: (240, 228, 66)}
 _COLORS |= {PATH: (213, 94, 0), PLAN: (230, 159, 0)}
 _OUTLINE, _HOLE = (0, 114, 178), (204, 121, 167)
 _LIFT = 0.01  # [m] height of lines above the surface, which would hide them
@@ -48,7 +48,7 @@ class Scene:
         before, self._drawn = self._drawn, {}
         self._draw_surface(snapshot, colors)
         if BOUND in parts:
-            self._draw_ghost(BOUND, *bound_sheet(snapshot.map, self.origin), opacity=0.3)
+            self._draw_ghost(BOUND, *bound_sheet(snapshot.map, self.origin), opacity=0.45)
         if CEILING in parts:
             self._draw_ghost(CEILING, *ceiling_sheet(snapshot.map, self.origin), opacity=0.25)
         if FRAMES in parts:

@@ -1,0 +1,1 @@
+"""The same recordings through torchelev and through other maps that users can install."""
