@@ -111,8 +111,11 @@ def learning() -> str:
 
 def limits() -> str:
     """Tabulate where torchelev is worse than its targets or than others."""
-    missed = [row for row in tables.verdicts(load(SPEED)).splitlines() if row.endswith("| missed |")]
-    total = len(tables.verdicts(load(SPEED)).splitlines()) - 2
+    verdicts = tables.verdicts(load(SPEED)).splitlines()[2:]
+    missed = [row for row in verdicts if row.endswith("| missed |")]
+    beside = report.average(load("peers"), report.CAMERA)
+    steps = {load("peers")["peers"][name]["title"]: 100 * row["rmse_at_steps"] for name, row in beside.items()}
+    volume = min(steps, key=steps.__getitem__)
     updates, sight = load("levels_speed")["updates"], load("sight")["rows"]
     deepest = max(row["ratio"] for row in updates)
     em_cupy = load("em_cupy")["milliseconds"]
@@ -124,7 +127,8 @@ def limits() -> str:
     heads = load("traversability", training.RESULTS)["held_out"]["4 cm"]
     unsafe = [100 * heads[name]["false_safe"] for name in heads if name.startswith("learned")]
     table = [
-        ["speed targets missed", f"{len(missed)} of {total}"],
+        ["speed targets missed", f"{len(missed)} of {len(verdicts)}"],
+        [f"error at steps; that of {volume}", f"{steps['torchelev']:.1f} cm; {steps[volume]:.1f} cm"],
         ["time of an update with three levels, over one level", f"up to {deepest:.1f} times"],
         [
             "time of an update like elevation_mapping_cupy's, over the default",
