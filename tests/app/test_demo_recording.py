@@ -58,3 +58,18 @@ def test_what_cannot_be_recorded_is_refused(tmp_path, monkeypatch):
     assert done.exit_code != 0 and "must be a bag's, got drive.txt" in done.output
     done = CliRunner().invoke(main, ["demo", "--record", "drive.mcap", "--seconds", "-1"])
     assert done.exit_code != 0 and "seconds: must be positive" in done.output and not list(tmp_path.iterdir())
+
+
+def test_a_recording_that_is_interrupted_leaves_the_older_one(tmp_path, monkeypatch):
+    (tmp_path / "drive.mcap").write_bytes(b"older")
+
+    def interrupted(walk):
+        yield next(iter(observe(walk)))
+        raise KeyboardInterrupt
+
+    observe = DemoWalk.observe
+    monkeypatch.setattr(DemoWalk, "observe", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        record_demo(tmp_path / "drive.mcap", 0.8, progress=False)
+    assert [path.name for path in tmp_path.iterdir()] == ["drive.mcap"]
+    assert (tmp_path / "drive.mcap").read_bytes() == b"older"
