@@ -218,4 +218,4 @@ docs: setup  ## build the documentation in docs/_build/html, warnings as errors;
 	@echo "Open docs/_build/html/index.html"
 
 clean:  ## remove what the targets made
-	rm -rf $(VENV) $(MJLAB) $(ISAACLAB) $(NEWTON) $(GENESIS) $(ROS2) $(ROS2)-torch $(MATRIX:%=.venv-%) demo.png docs/_build docs/notebooks
+	rm -rf $(VENV) $(MJLAB) $(ISAACLAB) $(NEWTON) $(GENESIS) $(PEERS) $(PEERS)-310 $(ROS2) $(ROS2)-torch $(MATRIX:%=.venv-%) demo.png docs/_build docs/notebooks

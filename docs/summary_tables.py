@@ -113,8 +113,9 @@ def limits() -> str:
     """Tabulate where torchelev is worse than its targets or than others."""
     verdicts = tables.verdicts(load(SPEED)).splitlines()[2:]
     missed = [row for row in verdicts if row.endswith("| missed |")]
-    beside = report.average(load("peers"), report.CAMERA)
-    steps = {load("peers")["peers"][name]["title"]: 100 * row["rmse_at_steps"] for name, row in beside.items()}
+    result = load("peers")
+    beside = report.average(result, report.CAMERA)
+    steps = {result["peers"][name]["title"]: 100 * row["rmse_at_steps"] for name, row in beside.items()}
     volume = min(steps, key=steps.__getitem__)
     updates, sight = load("levels_speed")["updates"], load("sight")["rows"]
     deepest = max(row["ratio"] for row in updates)

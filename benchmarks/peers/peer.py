@@ -93,3 +93,18 @@ class Cells:
         """Return the centres (H, W, 2) [m] of the cells."""
         axes = [self.setup.low[k] + self.setup.resolution * (np.arange(self.shape[k]) + 0.5) for k in (0, 1)]
         return np.stack(np.meshgrid(*axes, indexing="ij"), -1)
+
+
+class PointMap:
+    """The points of all scans in cells, and their mean: what peers that gather points begin with."""
+
+    def __init__(self, setup: Setup) -> None:
+        self.cells = Cells(setup)
+
+    def update(self, frame: Frame) -> None:
+        """Add the points."""
+        self.cells.add(frame.placed())
+
+    def ground(self) -> tuple[Array, Array | None]:
+        """Return the means and their standard errors."""
+        return self.cells.mean()

@@ -17,6 +17,7 @@ from torchelev.sim.exact.scenes import mixed, rough, stairs
 from torchelev.sim.exact.trajectories import Point
 
 RESOLUTION, SIDE, DT, SPEED = 0.05, 8.0, 0.1, 0.5  # [m], [m], [s], [m/s]
+LOW = (-3.0, -4.0)  # [m] corner of the area
 CAMERA, LIDAR = DepthCamera(), Lidar(rings=32, azimuths=512)
 T_CAMERA, T_LIDAR = mount(pitch_deg=35.0), mount(pitch_deg=0.0)
 HELD_OUT = 0.3  # share of a real scan's points
@@ -40,14 +41,14 @@ class Recording:
     events: list[int] = field(default_factory=list)  #: scans at which it did
 
 
-def _setup(sensor: DepthCamera | Lidar, low: tuple[float, float], height: float) -> Setup:
+def _setup(sensor: DepthCamera | Lidar, height: float) -> Setup:
     pinhole = None
     if isinstance(sensor, DepthCamera):
         K = sensor.intrinsics
         values = [float(value) for value in (K[0, 0], K[1, 1], K[0, 2], K[1, 2])]
         pinhole = (sensor.width, sensor.height, *values)
     cells = (round(SIDE / RESOLUTION),) * 2
-    return Setup(RESOLUTION, low, cells, sensor.max_range, height, pinhole)  # type: ignore[arg-type]
+    return Setup(RESOLUTION, LOW, cells, sensor.max_range, height, pinhole)  # type: ignore[arg-type]
 
 
 def _simulate(
@@ -56,7 +57,6 @@ def _simulate(
     path: list[Point],
     sensor: DepthCamera | Lidar,
     T_base_sensor: Tensor,
-    low: tuple[float, float] = (-3.0, -4.0),
     drift: bool = False,
     speed: float = SPEED,
 ) -> Recording:
@@ -65,7 +65,7 @@ def _simulate(
     generator = torch.Generator().manual_seed(0)
     errors = PoseErrors(preset("leg_odometry").pose, 1, seed=0) if drift else None
     height = float(poses.T_map_sensor[0, 2, 3] - scene.truth(poses.T_map_sensor[0, :2, 3]))
-    setup, frames = _setup(sensor, low, height), []
+    setup, frames = _setup(sensor, height), []
     cells = Cells(setup)
     seen = np.zeros(len(cells.sum), bool)
     for T_base, T_sensor, t in zip(*poses, strict=True):

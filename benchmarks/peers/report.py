@@ -110,10 +110,10 @@ def cell_text(column: Column, value: float) -> str:
 
 def _cell(column: Column, values: dict[str, float], best: float) -> str:
     value = values.get(column.key)
-    if value is None or value >= NEVER:
-        return "" if value is None else "never"
-    text = cell_text(column, value)
-    return f"**{text}**" if _rank(column, value) == best else text
+    if value is None:
+        return ""
+    text, is_best = cell_text(column, value), value < NEVER and _rank(column, value) == best
+    return f"**{text}**" if is_best else text
 
 
 def settings(result: dict[str, Any]) -> str:

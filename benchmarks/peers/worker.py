@@ -9,6 +9,8 @@ import pickle
 import sys
 import time
 
+from benchmarks.peers.peer import Peer
+
 
 def resident():
     """Return the memory [bytes] of this process."""
@@ -21,7 +23,9 @@ def main():
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what a package prints is no answer
     module = importlib.import_module("benchmarks.peers.maps." + sys.argv[1])
-    peer, least = None, 0
+    peer: Peer | None = None
+    answer: object
+    least = 0
     while True:
         try:
             given = pickle.load(sys.stdin.buffer)

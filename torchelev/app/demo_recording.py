@@ -69,12 +69,8 @@ def _write_camera(bag: BagWriter, stamp: float) -> None:
     named["roi"] = bag.make("sensor_msgs/msg/RegionOfInterest", **region, do_rectify=False)
     kind, model = "sensor_msgs/msg/CameraInfo", {"distortion_model": "plumb_bob", "binning_x": 0, "binning_y": 0}
     size = {"height": CAMERA.height, "width": CAMERA.width}
-    bag.write(
-        f"{TOPIC}/camera_info",
-        kind,
-        stamp,
-        bag.make(kind, header=bag.make_header(stamp, FRAME), **size, **model, **named),
-    )
+    message = bag.make(kind, header=bag.make_header(stamp, FRAME), **size, **model, **named)
+    bag.write(f"{TOPIC}/camera_info", kind, stamp, message)
 
 
 def _write_depth(bag: BagWriter, stamp: float, depth: NDArray) -> None:

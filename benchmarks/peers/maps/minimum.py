@@ -2,20 +2,13 @@
 
 import numpy as np
 
-from benchmarks.peers.peer import Array, Cells, Frame, Setup
+from benchmarks.peers.peer import Array, PointMap
 
 
-class Map:
-    """The lowest height that was ever measured in each cell."""
+class Map(PointMap):
+    """The lowest height ever measured in each cell."""
 
     TITLE, SETTINGS, NEEDS, TAKES = "minimum of each cell", "of all points", "", "points"
-
-    def __init__(self, setup: Setup) -> None:
-        self.cells = Cells(setup)
-
-    def update(self, frame: Frame) -> None:
-        """Add the points."""
-        self.cells.add(frame.placed())
 
     def ground(self) -> "tuple[Array, Array | None]":
         """Return the lowest heights."""

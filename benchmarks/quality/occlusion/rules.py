@@ -28,11 +28,9 @@ RULES = (*PREDICTED, IMPASSABLE, TRUTH)
 
 def predict(emap: ElevationMap, rule: str) -> tuple[Tensor, Tensor]:
     """Return the heights (B, H, W) [m] by one of PREDICTED, as measured where known, and where they are known."""
-    state = emap.state
     if rule == UPPER_BOUND:
-        known = state.validity | state.bounded
-        return torch.where(state.validity, state.elevation, state.upper_bound), known
-    return filters.Filter(INPAINTED[rule])((state.elevation, state.validity), resolution=GRID.resolution)
+        return emap.read_layer("upper_bound")
+    return filters.Filter(INPAINTED[rule])(emap.read_layer("elevation"), resolution=GRID.resolution)
 
 
 def true_heights(emap: ElevationMap, case: Case) -> Tensor:
