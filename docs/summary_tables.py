@@ -15,7 +15,7 @@ from torchelev.app.results import markdown_table
 
 
 def speed() -> str:
-    """Tabulate the time of updates and height scans, those of a GPU first, beside peers."""
+    """Tabulate the time of updates and height scans, those of a GPU first, and those of peers."""
     gpu, cpu, levels, filters = load(GPU), load(SPEED), load("levels"), load("postprocessing")
     size = gpu["many robots"]
     copied = 1e3 * gpu["many robots, expected bytes"] / gpu["copy, bytes per second"]
@@ -42,12 +42,12 @@ def speed() -> str:
     ratios = [row["ratio"] for row in filters["rows"] if row.get("ratio")]
     span = f"{min(ratios):.1f} to {max(ratios):.1f} times theirs"
     rows.append([_processor(filters), "filters of 1 to 256 maps", span, "OpenCV, SciPy"])
-    return markdown_table(["on", "what", "torchelev", "beside it"], rows)
+    return markdown_table(["on", "task", "torchelev", "compared with"], rows)
 
 
 PEER_SCORES = {  # the columns of the peers' table that are summed up
     "rmse": "error of the ground, RMSE [cm]",
-    "rmse_at_steps": "the same at steps [cm]",
+    "rmse_at_steps": "error at steps, RMSE [cm]",
     "reaction_scans": "scans until a change shows in the map",
     "p50_ms": "median time of a depth image [ms]",
 }
@@ -72,7 +72,7 @@ def _processor(result: dict[str, Any]) -> str:
 
 
 def accuracy() -> str:
-    """Tabulate errors beside those of peers."""
+    """Tabulate errors, and those of peers."""
     cases = {(row["scene"], row["motion"], row["noise"]): row for row in load("accuracy")["rows"]}
     real = {(row["recording"], row["resolution_m"], row["method"]): row for row in load("real")["rows"]}
     beside, poses = load("levels")["beside"]["all"], load("pose_covariance")["rows"]
@@ -84,14 +84,14 @@ def accuracy() -> str:
     rows.append(["p90 on a real off-road scan", f"{100 * own:.1f} cm", f"mean of the points: {100 * plain:.1f} cm"])
     ground = {name: f"{100 * beside[name]['ground_rmse']:.1f} cm" for name in beside}
     peers = ", ".join(f"{name}: {ground[name]}" for name in ("OctoMap", "VDBFusion"))
-    rows.append(["ground RMSE below tables, bridges, lintels; levels", ground["levels"], peers])
+    rows.append(["RMSE of the ground below tables, bridges and lintels, with levels", ground["levels"], peers])
     uncertain = [row for row in poses if row["preset"] != "perfect"]
     inside = [_span(100 * row[kind]["inside"] for row in uncertain) for kind in ("with", "without")]
-    rows.append(["truth within ± 2 σ, drifting poses", f"{inside[0]} %", f"without covariance: {inside[1]} %"])
+    rows.append(["true heights within ± 2 σ, drifting poses", f"{inside[0]} %", f"without covariance: {inside[1]} %"])
     scenes = load("em_cupy")["scenes"].values()
     agree = 100 * min(share for scene in scenes for kind in ("step", "run") for share in scene[kind].values())
-    rows.append(["cells that agree with elevation_mapping_cupy's", f"{agree:.1f} % or more", ""])
-    return markdown_table(["what", "torchelev", "beside it"], rows)
+    rows.append(["cells that agree with elevation_mapping_cupy", f"{agree:.1f} % or more", ""])
+    return markdown_table(["measure", "torchelev", "compared with"], rows)
 
 
 def learning() -> str:
@@ -129,25 +129,25 @@ def limits() -> str:
     unsafe = [100 * heads[name]["false_safe"] for name in heads if name.startswith("learned")]
     table = [
         ["speed targets missed", f"{len(missed)} of {len(verdicts)}"],
-        [f"error at steps; that of {volume}", f"{steps['torchelev']:.1f} cm; {steps[volume]:.1f} cm"],
-        ["time of an update with three levels, over one level", f"up to {deepest:.1f} times"],
+        [f"error at steps; {volume}'s error", f"{steps['torchelev']:.1f} cm; {steps[volume]:.1f} cm"],
+        ["time of an update with three levels, relative to one level", f"up to {deepest:.1f} times"],
         [
-            "time of an update like elevation_mapping_cupy's, over the default",
+            "time of an update like elevation_mapping_cupy's, relative to the default",
             f"{em_cupy['like_em_cupy'] / em_cupy['default']:.0f} times",
         ],
         [
-            "time of an environment step with the map, over one with the truth",
+            "time of an environment step with the map, relative to the true ground",
             f"{sight['step, map']['median'] / sight['step, truth']['median']:.1f} times",
         ],
         [
-            "a person who left: cells that remain, 16-ring lidar",
+            "cells that remain after a person left, 16-ring lidar",
             f"{left['cells'] / left['of']:.0f} per robot, {left['environments']} of {left['of']} robots",
         ],
-        ["goals reached with a scan of ceilings; without", f"{scan:.0f} %; {none:.0f} %"],
-        ["goals reached with unknown pixels in-painted; nominal ground", f"{inpaint:.0f} %; {base:.0f} %"],
-        ["learned head: unsafe cells rated safe where 95 % of the safe are", f"{mean(unsafe):.0f} %"],
+        ["goals reached with a ceiling scan; without", f"{scan:.0f} %; {none:.0f} %"],
+        ["goals reached with in-painted unknown pixels; with nominal ground", f"{inpaint:.0f} %; {base:.0f} %"],
+        ["learned head: unsafe cells rated safe when 95 % of the safe cells are", f"{mean(unsafe):.0f} %"],
     ]
-    return markdown_table(["what", "found"], table)
+    return markdown_table(["limit", "result"], table)
 
 
 def _success(rows: list[dict[str, Any]], key: str, value: str) -> float:

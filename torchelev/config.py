@@ -43,24 +43,24 @@ class ElevationMapConfig:
         ValueError: if a setting is out of range.
     """
 
-    grid: GridConfig = field(default_factory=GridConfig)  #: size of the window and its cells
-    sensor: SensorConfig = field(default_factory=SensorConfig)  #: noise, range, exclusion area and the robot's body
-    aging: AgingConfig = field(default_factory=AgingConfig)  #: process noise of cells that are not measured
-    #: drift compensation; None if the poses do not drift in height
+    grid: GridConfig = field(default_factory=GridConfig)  #: size of the window and of its cells
+    sensor: SensorConfig = field(default_factory=SensorConfig)  #: noise, range, exclusion area, and the robot's body
+    aging: AgingConfig = field(default_factory=AgingConfig)  #: process noise
+    #: compensation of height drift; None switches it off
     drift: DriftConfig | None = field(default_factory=DriftConfig)
     fusion: FusionConfig = field(default_factory=FusionConfig)  #: Kalman update and outlier gate
-    #: visibility clean-up and upper bound; None if nothing moves and no upper bound is needed
+    #: visibility clean-up and upper bound; None switches them off
     raycast: RaycastConfig | None = field(default_factory=RaycastConfig)
-    #: overlap clearance; None if there is one floor only
+    #: overlap clearance; None switches it off
     overlap: OverlapConfig | None = field(default_factory=OverlapConfig)
-    surface: SurfaceConfig = field(default_factory=SurfaceConfig)  #: window of the planes that normals are fitted to
-    #: the analytic head, or the learned one for a legged robot; None for no traversability
+    surface: SurfaceConfig = field(default_factory=SurfaceConfig)  #: window for fitting the planes of the normals
+    #: analytic head, or learned head for a legged robot; None: no traversability
     traversability: TraversabilityConfig | LearnedTraversabilityConfig | None = field(
         default_factory=TraversabilityConfig
     )
-    levels: LevelsConfig | None = None  #: surfaces of a cell besides the ground, such as ceilings; None: none
-    filters: tuple[FilterConfig, ...] = ()  #: further layers, computed when they are read: see `torchelev.filters`
-    #: what each cell holds besides its height, by name: `ChannelConfig`, or the word of a kind with its defaults
+    levels: LevelsConfig | None = None  #: surfaces besides the ground, such as ceilings; None: one height per cell
+    filters: tuple[FilterConfig, ...] = ()  #: additional layers, computed on reading: see `torchelev.filters`
+    #: further values of each cell by name: a `ChannelConfig`, or the name of a kind for its defaults
     channels: Mapping[str, Any] = field(default_factory=ChannelConfigs)
 
     def __post_init__(self) -> None:

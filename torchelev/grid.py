@@ -25,9 +25,9 @@ MIN_RESOLUTION = 1e-4  # [m] finer cells are no cells of ground, and their numbe
 class GridConfig:
     """Size of the window and of its cells."""
 
-    resolution: float = 0.04  #: [m] side of a cell; coarser is faster, finer shows smaller steps
-    length_x: float = 10.0  #: [m] of the window along x, a whole number of cells; larger maps farther, and is slower
-    length_y: float = 10.0  #: [m] of the window along y, a whole number of cells
+    resolution: float = 0.04  #: [m] side length of a cell; larger cells are faster, smaller cells show smaller steps
+    length_x: float = 10.0  #: [m] window length along x, a whole number of cells; a larger window is slower
+    length_y: float = 10.0  #: [m] window length along y, a whole number of cells
 
     def __post_init__(self) -> None:
         require_positive(**{"grid.resolution": self.resolution})

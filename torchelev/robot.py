@@ -12,13 +12,13 @@ from torchelev.errors import require, require_positive
 class RobotConfig:
     """Sizes and abilities of a legged robot that stands on four feet, at the corners of a rectangle."""
 
-    length: float = 0.7  #: [m] from front to hind feet
-    width: float = 0.4  #: [m] from left to right feet
-    foot_radius: float = 0.03  #: [m] of a foot's contact area
-    foot_reach: float = 0.1  #: [m] from a foot's nominal position to another foothold that it can choose
-    step_height: float = 0.2  #: [m] highest step that a foot can overcome
-    clearance: float = 0.3  #: [m] height of the belly over the feet
-    max_slope: float = 0.5  #: [rad] largest inclination of the body
+    length: float = 0.7  #: [m] distance from front to hind feet
+    width: float = 0.4  #: [m] distance from left to right feet
+    foot_radius: float = 0.03  #: [m] radius of a foot's contact area
+    foot_reach: float = 0.1  #: [m] maximum distance of a foothold from the foot's nominal position
+    step_height: float = 0.2  #: [m] maximum step height that a foot can overcome
+    clearance: float = 0.3  #: [m] height of the belly above the feet
+    max_slope: float = 0.5  #: [rad] maximum inclination of the body
 
     def __post_init__(self) -> None:
         require_positive(**{field.name: getattr(self, field.name) for field in fields(self)})

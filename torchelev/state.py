@@ -19,18 +19,18 @@ if TYPE_CHECKING:
 class Statistics(NamedTuple):
     """What the last update did, per environment. Counts are int64 (B,), heights are [m] (B,)."""
 
-    points_used: Int[Tensor, "B"]  #: fused into a cell's height
-    rejected_invalid: Int[Tensor, "B"]  #: NaN or inf
-    rejected_range: Int[Tensor, "B"]  #: nearer or farther than the sensor measures
-    rejected_body: Int[Tensor, "B"]  #: on the robot itself
-    rejected_overhang: Int[Tensor, "B"]  #: above the exclusion ramp, or on another surface than the ground
-    rejected_outside: Int[Tensor, "B"]  #: not over the window
-    rejected_outlier: Int[Tensor, "B"]  #: outside the Mahalanobis gate
-    rejected_edge: Int[Tensor, "B"]  #: on the wrong side of a step within their cell
-    drift_points: Int[Tensor, "B"]  #: that measured the height drift
+    points_used: Int[Tensor, "B"]  #: points fused into a cell's height
+    rejected_invalid: Int[Tensor, "B"]  #: points that are NaN or inf
+    rejected_range: Int[Tensor, "B"]  #: points outside the sensor's distance limits
+    rejected_body: Int[Tensor, "B"]  #: points on the robot itself
+    rejected_overhang: Int[Tensor, "B"]  #: points above the exclusion ramp, or on a surface other than the ground
+    rejected_outside: Int[Tensor, "B"]  #: points outside the window
+    rejected_outlier: Int[Tensor, "B"]  #: points outside the Mahalanobis gate
+    rejected_edge: Int[Tensor, "B"]  #: points on the wrong side of a step within their cell
+    drift_points: Int[Tensor, "B"]  #: points that measured the height drift
     drift_error: Float[Tensor, "B"]  #: [m] mean height error of these points
     drift_correction: Float[Tensor, "B"]  #: [m] added to the map's heights
-    #: [m] by which sensors, or successive scans, disagree in height; its square is part of every variance
+    #: [m] height difference between sensors or successive scans; its square is part of every variance
     disagreement: Float[Tensor, "B"]
     cleared_seen_through: Int[Tensor, "B"]  #: cells that visibility clean-up removed
     cleared_other_floors: Int[Tensor, "B"]  #: cells that overlap clearance removed
@@ -40,24 +40,24 @@ class Statistics(NamedTuple):
 class MapState(NamedTuple):
     """B robot-centric maps. No NaN: a value counts only where its mask says so."""
 
-    corner: Int[Tensor, "B 2"]  #: cell numbers of [..., 0, 0] on the map frame's lattice
+    corner: Int[Tensor, "B 2"]  #: cell numbers of [..., 0, 0] on the lattice of the map frame
     base_height: Float[Tensor, "B"]  #: [m] z of the last T_map_base
-    pose_covariance: Float[Tensor, "B 3 3"]  #: [m^2] of the position that all elevations count from; see `pose_error`
+    pose_covariance: Float[Tensor, "B 3 3"]  #: [m^2] of the position that all elevations refer to; see `pose_error`
     elapsed: Int[Tensor, "B"]  #: [ns] sum of all dt since the reset; a cell's last hit was at elapsed * 1e-9 - time [s]
     elevation: Float[Tensor, "B H W"]  #: [m] map frame
     variance: Float[Tensor, "B H W"]  #: [m^2]
-    validity: Bool[Tensor, "B H W"]  #: elevation is known
-    support: Float[Tensor, "B H W"]  #: points that agree, less points that disagree
+    validity: Bool[Tensor, "B H W"]  #: whether the elevation is known
+    support: Float[Tensor, "B H W"]  #: points that agree minus points that disagree
     challenger: Float[Tensor, "B H W"]  #: [m] lowest height that contradicts the elevation from above; no gradient
-    challenger_support: UInt8[Tensor, "B H W"]  #: points that do so, less points that do not
-    time: Float[Tensor, "B H W"]  #: [s] since the last hit; of unknown cells it stands still
-    upper_bound: Float[Tensor, "B H W"]  #: [m] of cells that are not known
-    bounded: Bool[Tensor, "B H W"]  #: upper_bound is known; of known cells only until `clear_seen_through`
+    challenger_support: UInt8[Tensor, "B H W"]  #: points that agree with the challenger minus points that do not
+    time: Float[Tensor, "B H W"]  #: [s] time since the last hit; constant in unknown cells
+    upper_bound: Float[Tensor, "B H W"]  #: [m] upper bound of unknown cells
+    bounded: Bool[Tensor, "B H W"]  #: whether upper_bound is known; in known cells only until `clear_seen_through`
     gradient_x: Float[Tensor, "B H W"]  #: dz/dx
     gradient_y: Float[Tensor, "B H W"]  #: dz/dy
-    has_normal: Bool[Tensor, "B H W"]  #: the known neighbours span a plane; elsewhere the gradient is 0
+    has_normal: Bool[Tensor, "B H W"]  #: whether the known neighbours span a plane; elsewhere the gradient is 0
     traversability: Float[Tensor, "B H W"]  #: in [0, 1]
-    rated: Bool[Tensor, "B H W"]  #: the known cells of the head's window span a plane; elsewhere traversability is 0
+    rated: Bool[Tensor, "B H W"]  #: whether known cells span the head's window; elsewhere traversability is 0
     statistics: Statistics  #: of the last update
 
 

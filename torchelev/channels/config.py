@@ -39,17 +39,17 @@ class ChannelConfig:
         ValueError: a setting is out of range.
     """
 
-    kind: str = "mean"  #: one of KINDS
-    #: of the components; of classes, those of the classes; ("red", "green", "blue") makes a colour of any kind
+    kind: str = "mean"  #: kind of the channel, one of KINDS
+    #: names of the components or classes; ("red", "green", "blue") makes any kind a colour
     names: tuple[str, ...] = ()
-    size: int = 0  #: C, number of components; 0: that of `names`, 3 of a colour, else 1
-    rate: float = 0.7  #: share of a new mean in "exponential" and "class_average"
-    prior: float = 1.0  #: points that all classes have before the first, together
-    normalize: bool = True  #: read features as vectors of length 1
-    half_life: float | None = None  #: [s] in which the evidence halves, so that new points count more; None: never
-    max_age: float | None = None  #: [s] since a cell was last seen, after which it is forgotten; None: never
-    tolerance: float = 0.05  #: [m] in height, see above
-    dtype: str = "float32"  #: of what is stored, "float32" or "float16"
+    size: int = 0  #: C, number of components; 0: the number of `names`, 3 for a colour, otherwise 1
+    rate: float = 0.7  #: weight of a new mean in "exponential" and "class_average"
+    prior: float = 1.0  #: weight of the uniform prior over all classes, in points
+    normalize: bool = True  #: normalise features to length 1 on reading
+    half_life: float | None = None  #: [s] time in which the evidence halves, so that new points count more; None: never
+    max_age: float | None = None  #: [s] time after which a cell that is no longer seen is forgotten; None: never
+    tolerance: float = 0.05  #: [m] maximum height difference from the elevation, see above
+    dtype: str = "float32"  #: type of the stored values, "float32" or "float16"
 
     def __post_init__(self) -> None:
         is_list = isinstance(self.names, list | tuple)

@@ -22,11 +22,11 @@ class FilterConfig:
     In YAML it is an entry of the list `filters`: `- {layer: smooth, filter: gaussian, inputs: elevation, sigma: 0.1}`.
     """
 
-    layer: str  #: name of the layer it makes
+    layer: str  #: name of the layer that the filter makes
     filter: str  #: name of the filter, see `FILTERS`
-    #: names of the layers it reads; default: elevation, and for an expression the layers in its formula
+    #: names of the layers that the filter reads; by default elevation, or the layers in the formula of an expression
     inputs: tuple[str, ...] | str = ()
-    settings: Mapping[str, Any] | tuple[tuple[str, Any], ...] = ()  #: the filter's settings, by name
+    settings: Mapping[str, Any] | tuple[tuple[str, Any], ...] = ()  #: settings of the filter, by name
 
     def __post_init__(self) -> None:
         settings = {name: _hashable(value) for name, value in dict(self.settings).items()}

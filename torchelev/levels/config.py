@@ -24,14 +24,14 @@ class LevelsConfig:
         ValueError: if a setting is out of range.
     """
 
-    max_levels: int = 3  #: K surfaces of a cell, the ground included, 1 to 8; 1: the ground alone
-    #: [m] free height between two surfaces; a smaller space counts as solid. Give the least that the robot fits through
+    max_levels: int = 3  #: maximum number of surfaces per cell, including the ground, 1 to 8; 1: only the ground
+    #: [m] minimum free height between two surfaces; a smaller gap counts as solid
     min_gap: float = 0.4
-    #: what shows that the space between two surfaces is free: "rays" that pass through it, or the "gap" alone
+    #: evidence for free space between two surfaces: "rays" that pass through it, or only the "gap"
     separation: str = "rays"
-    max_step: float = 0.3  #: [m] that the robot can step up or down from a cell to the next
-    max_blind: float = 0.5  #: [m] of unknown cells over which the ground is taken to go on
-    min_support: float = 3.0  #: points that a surface needs to be reported, or chosen as the ground
+    max_step: float = 0.3  #: [m] maximum height difference between neighbouring cells that the robot can step
+    max_blind: float = 0.5  #: [m] maximum width of unknown cells across which the ground continues
+    min_support: float = 3.0  #: minimum number of points for a surface to be reported or chosen as the ground
 
     def __post_init__(self) -> None:
         K, rule = self.max_levels, f"must be a whole number from 1 to {MAX_LEVELS}"

@@ -27,7 +27,7 @@ def _require_link(name: str, link: object) -> None:
 class Capsule:
     """A cylinder with half a sphere on each end. A sphere has `start` = `end`."""
 
-    link: str  #: name of the link that it is fixed to
+    link: str  #: name of the link that the shape is fixed to
     start: tuple[float, float, float]  #: [m] one end of the axis, link frame
     end: tuple[float, float, float]  #: [m] the other end of the axis, link frame
     radius: float  #: [m]
@@ -48,8 +48,8 @@ class Capsule:
 class Box:
     """A box that may be turned in its link's frame."""
 
-    link: str  #: name of the link that it is fixed to
-    center: tuple[float, float, float]  #: [m] link frame
+    link: str  #: name of the link that the shape is fixed to
+    center: tuple[float, float, float]  #: [m] centre of the box, link frame
     half_lengths: tuple[float, float, float]  #: [m] half the side lengths along the box's own x, y, z
     quat_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)  #: rotation of the box in the link frame
 
@@ -78,13 +78,13 @@ class RobotBody:
         ValueError: if there is no shape, or a number is out of range.
     """
 
-    capsules: tuple[Capsule, ...] = ()  #: such as legs, and feet as spheres
-    boxes: tuple[Box, ...] = ()  #: such as the trunk
-    #: [m] by which shapes are larger on all sides: errors of mounting, joint encoders and shapes. Of a robot whose
-    #: errors are larger, more removes points at the legs' rims; it also removes more of the ground at the feet
+    capsules: tuple[Capsule, ...] = ()  #: legs, for example, and feet as spheres
+    boxes: tuple[Box, ...] = ()  #: the trunk, for example
+    #: [m] margin around all shapes for errors of the mounting, joint encoders and shapes; a larger margin removes more
+    #: points at the legs, and also more ground at the feet
     padding: float = 0.003
-    #: [m] by which a point may be measured too near: three standard deviations of the depth at the legs' distance, of
-    #: the default noise at 0.8 m. Larger removes more of what is between the sensor and a leg, and no ground
+    #: [m] by which a point may be measured too near; default: three standard deviations of the default noise at 0.8 m;
+    #: a larger tolerance removes more points between the sensor and a leg, but no ground
     depth_tolerance: float = 0.03
 
     def __post_init__(self) -> None:

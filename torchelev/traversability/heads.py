@@ -56,12 +56,12 @@ class TraversabilityConfig:
         TypeError: for a robot that is not a RobotConfig.
     """
 
-    radius: float = 0.1  #: [m] of the window that a foot or wheel needs
-    critical_slope: float = 0.7  #: [rad] inclination of the window's plane, below pi / 2; inf: slopes do not count
-    #: [m] height difference between a cell and those within the window, at most 0.1 m away; inf: steps do not count
+    radius: float = 0.1  #: [m] radius of the window that a foot or wheel needs
+    critical_slope: float = 0.7  #: [rad] maximum slope of the window's plane, below pi / 2; inf: slopes are ignored
+    #: [m] maximum step between a cell and the cells of its window, at most 0.1 m away; inf: steps are ignored
     critical_step: float = 0.2
-    critical_roughness: float = 0.05  #: [m] standard deviation around the local plane; inf: roughness does not count
-    robot: RobotConfig | None = None  #: the robot whose limits planning enforces, see `of_robot`; None: no robot
+    critical_roughness: float = 0.05  #: [m] maximum standard deviation around the plane; inf: roughness is ignored
+    robot: RobotConfig | None = None  #: robot whose limits planning enforces, see `of_robot`; None: no robot
 
     # From which rating on cells measure the height drift; measured by `training.traversability.drift_gate`.
     drift_gate: ClassVar[float] = 0.5
@@ -128,9 +128,9 @@ class Critical(NamedTuple):
 class LearnedTraversabilityConfig:
     """The trained head: the robot that it rates the ground for, and a file of weights if not those of torchelev."""
 
-    #: size and abilities of the robot that the ground is rated for
+    #: size and abilities of the robot
     robot: RobotConfig = field(default_factory=RobotConfig)
-    weights: str | Path | None = None  #: file that `TraversabilityNet.save` wrote; None: the shipped weights
+    weights: str | Path | None = None  #: file written by `TraversabilityNet.save`; None: the shipped weights
 
     drift_gate: ClassVar[float] = 0.2  # as of the analytic head
 

@@ -9,9 +9,9 @@ from torchelev.errors import require
 
 @dataclass(frozen=True, kw_only=True)
 class AgingConfig:
-    """How fast an estimate loses certainty while it is not measured."""
+    """Process noise: how fast the variance of a cell grows."""
 
-    variance_rate: float = 1e-7  #: [m^2/s] sigma_t^2 per second: 1 cm after 17 minutes
+    variance_rate: float = 1e-7  #: [m^2/s] sigma_t^2 per second: a standard deviation of 1 cm after 17 minutes
 
     def __post_init__(self) -> None:
         rate = self.variance_rate

@@ -17,13 +17,13 @@ MAX_REFINEMENTS = 100  # after some thirty, float32 has no digits left
 class EdgeConfig:
     """When a cell counts as a step: many points, and many of them far from the cell's estimate."""
 
-    min_points: int = 6  #: points of a cell from which on it can hold a step
-    min_share: float = 0.25  #: of the cell's points outside the gate around its estimate
-    min_passed: float = 0.1  #: of its low points, how many passed the centre for the ground to win over the top
-    min_extreme: int = 2  #: points within a standard deviation of the top or bottom, or beyond; fewer are outliers
-    refinements: int = 7  #: each halves the distance to the top of a wall's face
-    margin: float = 0.25  #: standard deviations below the top that still belong to it
-    min_settled: float = 6.0  #: points; support from which a wall's top stands although a scan sees less of its face
+    min_points: int = 6  #: minimum number of points in a cell with a step
+    min_share: float = 0.25  #: minimum share of the cell's points outside the gate
+    min_passed: float = 0.1  #: share of the low points that must pass the centre for the ground to win over the top
+    min_extreme: int = 2  #: minimum number of points within a standard deviation of the top or bottom
+    refinements: int = 7  #: iterations; each halves the distance to the top of a wall
+    margin: float = 0.25  #: standard deviations below the top within which points belong to the top
+    min_settled: float = 6.0  #: minimum support [points] for a wall's top to persist although a scan sees less of it
 
     def __post_init__(self) -> None:
         for name, least in dict(min_points=2, min_extreme=1, refinements=2).items():
@@ -41,12 +41,12 @@ class EdgeConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class AveragingConfig(ByTensors):
-    """Averaged fusion as elevation_mapping_cupy computes it: see `average`. Tensors update maps with it."""
+    """Averaged fusion as elevation_mapping_cupy computes it: see `average`. Uses tensor operations."""
 
     gate_per_variance: float = 2.0  #: [1/m] a point is an outlier if |z - h| > gate_per_variance * sigma_m^2
     variance_per_outlier: float = 0.01  #: [m^2] added to a cell's variance for each outlier
-    unknown_variance: float = 1000.0  #: [m^2] of a cell that is not known, when its first points come
-    wall_points: int | None = 20  #: a cell with more points ignores those below its elevation; None: it averages all
+    unknown_variance: float = 1000.0  #: [m^2] variance of an unknown cell before its first points
+    wall_points: int | None = 20  #: cells with more points ignore those below their elevation; None: average all
 
     def __post_init__(self) -> None:
         for name in ("gate_per_variance", "unknown_variance"):
@@ -63,16 +63,16 @@ class FusionConfig:
     """Kalman update and outlier gate."""
 
     gate: float = 3.0  #: Mahalanobis distance beyond which a point is an outlier
-    max_gate_std: float = 0.05  #: [m] an uncertain cell's gate grows no wider, or an outlier would slip in
-    relief: float = 0.25  #: [cells] standard deviation of height within a cell of rough or sloped ground
-    scan_variance_floor: float = 1e-6  #: [m^2] points of one scan share the error of its pose
-    outlier_variance: float = 1e-4  #: [m^2] added by a scan that mostly disagrees
-    max_support: float = 60.0  #: points; how many must disagree until a settled cell is founded anew
-    min_above: int = 5  #: points above a cell, `challenge.py`, that found it anew, however settled it is
-    max_above_per_scan: int = 2  #: of those points, how many one scan adds: a single bad scan is no obstacle
-    max_variance: float = 1.0  #: [m^2] a cell's variance grows no larger
-    edges: EdgeConfig | None = EdgeConfig()  #: walls and steps kept sharp; None: every cell averages its points
-    averaging: AveragingConfig | None = None  #: in place of all of the above but `max_variance`; None: see `fuse`
+    max_gate_std: float = 0.05  #: [m] upper limit of a cell's standard deviation in the gate
+    relief: float = 0.25  #: [cells] standard deviation of the height within a cell of rough or sloped ground
+    scan_variance_floor: float = 1e-6  #: [m^2] minimum variance of a scan; its points share the error of the pose
+    outlier_variance: float = 1e-4  #: [m^2] added to a cell's variance by a scan that mostly disagrees
+    max_support: float = 60.0  #: upper limit of support: so many points must disagree to replace a settled cell
+    min_above: int = 5  #: points above a cell that replace its height, regardless of its support: `challenge.py`
+    max_above_per_scan: int = 2  #: upper limit of these points per scan, so that a single bad scan adds no obstacle
+    max_variance: float = 1.0  #: [m^2] upper limit of a cell's variance
+    edges: EdgeConfig | None = EdgeConfig()  #: walls and steps within a cell; None: every cell averages its points
+    averaging: AveragingConfig | None = None  #: replaces all of the above except `max_variance`; None: see `fuse`
 
     def __post_init__(self) -> None:
         fits, hint = self.edges is None or isinstance(self.edges, EdgeConfig), "None keeps no edges sharp"

@@ -22,18 +22,18 @@ class BodyConfig:
 class ExclusionConfig:
     """The ramp of the paper's Fig. 3: points above it are overhangs, not ground."""
 
-    slope: float = 0.3  #: tan(theta_a)
+    slope: float = 0.3  #: tan(theta_a), the slope of the ramp
     distance: float = 1.0  #: [m] b: horizontal distance at which the ramp starts to rise
     offset: float = 0.2  #: [m] c: height above the sensor before b
-    height: float = 1.0  #: [m] d: height above the sensor that is never exceeded
+    height: float = 1.0  #: [m] d: maximum height of the ramp above the sensor
 
 
 @dataclass(frozen=True, kw_only=True)
 class DepthConfig(ByTensors):
-    """A camera's noise and ramp as elevation_mapping_cupy computes them. Tensors update maps with it."""
+    """A camera's noise and ramp as elevation_mapping_cupy computes them. Uses tensor operations."""
 
-    factor: float = 0.05  #: added to sigma_p^2: factor * z^2, with z along the sensor's own z axis
-    ramp_from_center: bool = True  #: the ramp's `distance` counts from the window's centre, not from the sensor
+    factor: float = 0.05  #: adds factor * z^2 to sigma_p^2, with z along the sensor's own z axis
+    ramp_from_center: bool = True  #: measure the ramp's `distance` from the window's centre instead of the sensor
 
     def __post_init__(self) -> None:
         good, hint = 0 <= self.factor < math.inf, "give 0.05"
@@ -44,15 +44,15 @@ class DepthConfig(ByTensors):
 class SensorConfig:
     """Noise model and gates of the points."""
 
-    noise_factor: float = 1e-4  #: alpha_d: sigma_p^2 = alpha_d * d^2 + noise_floor; 1 % of the distance
-    noise_floor: float = 2.5e-5  #: [m^2] variance of a point beside the sensor: (5 mm)^2
-    min_distance: float = 0.1  #: [m] from the sensor; nearer points are ignored
-    max_distance: float = 50.0  #: [m] from the sensor; farther points are ignored
-    #: ramp above which points are overhangs; None: every point counts
+    noise_factor: float = 1e-4  #: alpha_d in sigma_p^2 = alpha_d * d^2 + noise_floor; default: 1 % of the distance
+    noise_floor: float = 2.5e-5  #: [m^2] variance of a point at distance 0: (5 mm)^2
+    min_distance: float = 0.1  #: [m] minimum distance of a point from the sensor
+    max_distance: float = 50.0  #: [m] maximum distance of a point from the sensor
+    #: ramp above which points are overhangs; None: every point is used
     exclusion: ExclusionConfig | None = ExclusionConfig()
-    #: the robot itself, whose points are ignored: a box in the base frame, or the shapes of its links; None: none are
+    #: the robot's body, on which points are ignored: a box in the base frame, or the shapes of links; None: no body
     body: BodyConfig | RobotBody | None = None
-    depth: DepthConfig | None = None  #: noise that grows with the depth; None: with the distance alone
+    depth: DepthConfig | None = None  #: noise that grows with the depth; None: noise grows with the distance
 
     def __post_init__(self) -> None:
         require(self.noise_factor >= 0, "sensor.noise_factor", "must not be negative", self.noise_factor, "give 1e-4")

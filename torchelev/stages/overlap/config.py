@@ -11,10 +11,10 @@ from torchelev.stages.by_tensors import ByTensors
 
 @dataclass(frozen=True, kw_only=True)
 class SquareConfig(ByTensors):
-    """A square that is cleared, as elevation_mapping_cupy does: see `clear_square`. Tensors update maps with it."""
+    """Square that is cleared, as in elevation_mapping_cupy: see `clear_square`. Uses tensor operations."""
 
-    side: float = 4.0  #: [m] of the square in the window's middle
-    height: float = 2.0  #: [m] heights farther from the first sensor's, below or above, are cleared
+    side: float = 4.0  #: [m] side length of the square in the window's centre
+    height: float = 2.0  #: [m] maximum height difference from the first sensor; other cells are cleared
 
     def __post_init__(self) -> None:
         for name in ("side", "height"):
@@ -24,13 +24,13 @@ class SquareConfig(ByTensors):
 
 @dataclass(frozen=True, kw_only=True)
 class OverlapConfig:
-    """What is near, what is another floor, and how high robots are."""
+    """Which cells near the robot count as another floor."""
 
-    radius: float = 3.0  #: [m] horizontal distance from the base
-    height: float = 1.5  #: [m] difference from the robot's height
-    base_height: float = 0.6  #: [m] the robot's height is its base's, but no higher than this above its ground
-    max_base_height: float = 2.5  #: [m] ground farther below the base is not what the robot stands on
-    square: SquareConfig | None = None  #: in place of all of the above; None: see `clear_other_floors`
+    radius: float = 3.0  #: [m] horizontal distance from the base within which cells are cleared
+    height: float = 1.5  #: [m] maximum height difference from the robot; other cells are cleared
+    base_height: float = 0.6  #: [m] upper limit of the robot's height above its ground
+    max_base_height: float = 2.5  #: [m] maximum height of the base above the ground that it stands on
+    square: SquareConfig | None = None  #: replaces all of the above; None: see `clear_other_floors`
 
     def __post_init__(self) -> None:
         require(self.radius > 0, "overlap.radius", "must be positive", self.radius, "give metres, or overlap=None")

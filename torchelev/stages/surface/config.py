@@ -12,9 +12,9 @@ from torchelev.stages.by_tensors import ByTensors
 
 @dataclass(frozen=True, kw_only=True)
 class UpperBoundConfig(ByTensors):
-    """Normals, and a rating, of the upper bound as in elevation_mapping_cupy. Tensors update maps with it."""
+    """Normals, and a rating, of the upper bound as in elevation_mapping_cupy. Uses tensor operations."""
 
-    dilation: int = 3  #: [cells] within which unknown ground takes the height of a cell that is known or bounded
+    dilation: int = 3  #: [cells] distance within which unknown ground takes the height of a known or bounded cell
     #: .npz of that package's traversability filter, see `PaperFilter.from_npz`; None: `traversability` rates
     filter_weights: str | Path | None = None
 
@@ -26,10 +26,10 @@ class UpperBoundConfig(ByTensors):
 
 @dataclass(frozen=True, kw_only=True)
 class SurfaceConfig:
-    """How far the plane of a normal reaches."""
+    """Window of the plane that is fitted for a normal."""
 
-    radius: int = 1  #: [cells] 1: the 3 x 3 neighbours
-    upper_bound: UpperBoundConfig | None = None  #: normals of the upper bound; None: of planes through the elevation
+    radius: int = 1  #: [cells] radius of the window; 1: the 3 x 3 neighbours
+    upper_bound: UpperBoundConfig | None = None  #: normals of the upper bound; None: normals of the elevation
 
     def __post_init__(self) -> None:
         require(self.radius >= 1, "surface.radius", "must be at least 1 cell", self.radius, "give 1")

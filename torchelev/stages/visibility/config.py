@@ -15,9 +15,9 @@ MAX_CELLS = 2**14  # that rays count up to: C++ counts the places of the polar t
 
 @dataclass(frozen=True, kw_only=True)
 class SteppingConfig(ByTensors):
-    """Rays that are followed by steps, as elevation_mapping_cupy does: see `clear_by_steps`. By tensors."""
+    """Ray marching as in elevation_mapping_cupy: see `clear_by_steps`. Uses tensor operations."""
 
-    validity_per_ray: float = 0.1  #: taken off a cell's validity by a ray of `max_range`; shorter rays take more
+    validity_per_ray: float = 0.1  #: decrease of a cell's validity by a ray of `max_range`; more for shorter rays
     variance_per_ray: float = 0.01  #: [m^2] added to a cell's variance by each ray that passes below it
 
     def __post_init__(self) -> None:
@@ -30,12 +30,12 @@ class SteppingConfig(ByTensors):
 class RaycastConfig:
     """When a ray removes a cell, and which rays are accepted."""
 
-    min_time: float = 1.0  #: [s] cells hit within it stay, and contradict rays that pass below them
-    min_incidence: float = 0.1  #: alpha_n: |r . n| below it is a grazing ray
-    max_range: float | None = None  #: [m] rays count up to here; None: 1.1 half-diagonals of the window
-    min_support: float = 3.0  #: points that agree with a cell, or one beside it, for rays that end there to be accepted
-    gate: float = 3.0  #: a ray so many standard deviations below ground that is known is a wrong return
-    steps: SteppingConfig | None = None  #: rays lower validities step by step, see there; None: the lowest ray decides
+    min_time: float = 1.0  #: [s] cells hit within this time stay, and contradict rays that pass below them
+    min_incidence: float = 0.1  #: alpha_n: rays with |r . n| below it are grazing and remove nothing
+    max_range: float | None = None  #: [m] length up to which rays are used; None: 1.1 half-diagonals of the window
+    min_support: float = 3.0  #: minimum support of a cell, or of a neighbour, to accept rays that end in it
+    gate: float = 3.0  #: rays more standard deviations below known ground are wrong returns
+    steps: SteppingConfig | None = None  #: step along each ray, see `SteppingConfig`; None: the lowest ray decides
 
     def __post_init__(self) -> None:
         require(self.min_time >= 0, "raycast.min_time", "must not be negative", self.min_time, "give seconds")
