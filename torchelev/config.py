@@ -87,6 +87,11 @@ class ElevationMapConfig:
             self.traversability.require_grid(self.grid)
 
     @property
+    def has_levels(self) -> bool:
+        """Whether cells hold other surfaces than the ground."""
+        return self.levels is not None and self.levels.others > 0
+
+    @property
     def drift_gate(self) -> float:
         """The least traversability of cells that measure the height drift: the setting, or the head's default.
 

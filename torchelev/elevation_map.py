@@ -34,6 +34,7 @@ from torchelev.inputs.update_inputs import (
     takes_features,
 )
 from torchelev.kernels.choose import Backend, choose
+from torchelev.levels.compiled import StoredLevels
 from torchelev.levels.functional import forward as update_with_levels
 from torchelev.levels.functional import require_levels
 from torchelev.levels.state import Levels
@@ -95,9 +96,7 @@ class ElevationMap(RestartableMap):
         self.update_times = UpdateTimes()
         self._links = cfg.sensor.links
         # Compiled stages are shared by maps of equal ones.
-        self._update_cfg = dataclasses.replace(cfg, filters=(), channels=ChannelConfigs(), levels=None)
-        if self.levels is not None:  # which choose the floor, and keep the others
-            self._update_cfg = dataclasses.replace(self._update_cfg, overlap=None)
+        self._update_cfg = dataclasses.replace(cfg, filters=(), channels=ChannelConfigs())
         self._only_by_tensors = pipeline.only_by_tensors(cfg)
         self._key = pipeline.register_stages(self._update_cfg)
         self._history = InputHistory()
@@ -166,26 +165,31 @@ class ElevationMap(RestartableMap):
         weights = None if self._weights is None else self._weights.detached()
         # A seventh faster than `no_grad`, as views need no bookkeeping; the buffers stay normal tensors.
         with torch.inference_mode():
-            measured = inputs if self.levels is None else self.levels.sort_points(state, inputs, self._recenter)
-            self._run_stages(state, measured, weights)
-            if self.levels is not None:
-                self.levels.follow_drift(state)
+            self._run_stages(state, inputs, weights)
         if self.channels is not None:
             own = find_own(inputs, self.cfg.sensor) if brought else None
             self.channels.update(self.state, time_step(inputs.dt, torch.float32), inputs, own, brought)
 
     def _run_stages(self, state: MapState, inputs: Inputs, weights: Weights | None) -> None:
-        """Update a state of these maps by the backend that suits it."""
-        name, run = self.backend.name, functools.partial(update_by_tensors, cfg=self._update_cfg, weights=weights)
+        """Update these maps by the backend that suits them."""
+        name = self.backend.name
+        if self.levels is None or name == "CPU":
+            return self._run_backend(
+                name, state, inputs, weights, None if self.levels is None else self.levels.compiled
+            )
+        self._run_backend(name, state, self.levels.sort_points(state, inputs), weights)
+        self.levels.follow_drift(state)
+
+    def _run_backend(
+        self, name: str, state: MapState, inputs: Inputs, weights: Weights | None, levels: StoredLevels | None = None
+    ) -> None:
+        """Update a state, and levels where C++ does so, by a backend."""
+        run = functools.partial(update_by_tensors, cfg=self._update_cfg, weights=weights)
         if name != "TORCH":
             run = functools.partial(update_in_place, cfg=self._update_cfg, weights=weights, key=self._key)
-        if name == "CPU" and weights is None:
-            return run(state, inputs)  # chunks would save no memory: C++ keeps one map's for each thread
-        return run_in_chunks(run, state, inputs, self.chunks)
-
-    def _recenter(self, state: MapState, inputs: Inputs) -> None:
-        """Move the windows of a state as an update with these inputs does."""
-        pipeline.recenter_in_place(state, inputs, self._update_cfg, self._key if self.backend.name == "CPU" else -1)
+        # Chunks would save no memory in C++, which keeps one map's for each thread.
+        chunks = [slice(None)] if name == "CPU" and weights is None else self.chunks
+        run_in_chunks(run, state, inputs, chunks, levels)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore a copy or an unpickled map, whose process may know its config by another key."""
@@ -322,12 +326,14 @@ class ElevationMap(RestartableMap):
     def _update_scratch(self, inputs: Inputs) -> None:
         """Run an update on blank maps, as large as these."""
         weights = None if self._weights is None else self._weights.detached()
+        name = self.backend.name
         with torch.inference_mode():
-            self._run_stages(map_layers(torch.zeros_like, self.state), inputs, weights)
+            levels = None
+            if self.levels is not None and name == "CPU":
+                levels = StoredLevels(*map(torch.zeros_like, self.levels.compiled))
+            self._run_backend(name, map_layers(torch.zeros_like, self.state), inputs, weights, levels)
         if self.channels is not None and is_readable(self.elevation):
             build_libraries()
-        if self.levels is not None:
-            self.levels.build()
 
     # Diagnosis ------------------------------------------------------------------------------------------------------
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -14,6 +13,8 @@ from torchelev.inputs.update_inputs import Inputs
 from torchelev.kernels import cpu_update
 from torchelev.kernels.cpu_update import CpuUpdate, as_inputs
 from torchelev.kernels.cuda_update import CudaUpdate
+from torchelev.levels.compiled import KERNEL as LEVELS
+from torchelev.levels.compiled import StoredLevels
 from torchelev.stages.age.kernel import KERNEL as AGE
 from torchelev.stages.age.stage import age
 from torchelev.stages.by_tensors import ByTensors
@@ -40,8 +41,12 @@ if TYPE_CHECKING:
     from torchelev.traversability.weight_file import Weights
 
 #: Of all stages, in no order.
-KERNELS = (MEASURE, RECENTER, AGE, COMPENSATE, DISAGREEMENT, FUSION, VISIBILITY, OVERLAP, SURFACE)
-TENSORS: tuple[Any, ...] = (("Statistics", Statistics, {}), ("MapState", MapState, {"statistics": "Statistics"}))
+KERNELS = (MEASURE, RECENTER, AGE, COMPENSATE, DISAGREEMENT, FUSION, VISIBILITY, OVERLAP, SURFACE, LEVELS)
+TENSORS: tuple[Any, ...] = (
+    ("Statistics", Statistics, {}),
+    ("MapState", MapState, {"statistics": "Statistics"}),
+    ("StoredLevels", StoredLevels, {}),
+)
 
 
 class Stage(NamedTuple):
@@ -63,7 +68,10 @@ STAGES = (
     ),
     Stage("fuse", lambda state, m, cfg: fuse(state, m, cfg.grid, cfg.fusion, has_rays=cfg.raycast is not None)),
     Stage("clear_seen_through", lambda state, m, cfg: clear_seen_through(state, m, cfg.grid, cfg.raycast)),
-    Stage("clear_other_floors", lambda state, m, cfg: clear_other_floors(state, m, cfg.grid, cfg.overlap)),
+    Stage(
+        "clear_other_floors",  # levels choose the floor, and keep the others
+        lambda state, m, cfg: clear_other_floors(state, m, cfg.grid, None if cfg.has_levels else cfg.overlap),
+    ),
     Stage("count_bounded", lambda state, m, cfg: count_bounded(state)),
     Stage("add_disagreement", lambda state, m, cfg: add_disagreement(state)),
     Stage("rate_surface", lambda state, m, cfg: rate_surface(state, cfg.grid, cfg.surface, cfg.traversability)),
@@ -71,6 +79,10 @@ STAGES = (
 
 #: The names of all steps of an update, as the compiled backends run them.
 ORDER = ("measure", *(stage.name for stage in STAGES))
+
+#: The same of maps with levels, which take their points out of a scan before any other stage reads it, and follow the
+#: drift of the ground: `functional.forward` of levels, by tensors.
+ORDER_WITH_LEVELS = ("measure", "recenter", "sort_levels", *(n for n in ORDER[1:] if n != "recenter"), "raise_levels")
 
 
 def forward(state: MapState, m: Measurement, cfg: ElevationMapConfig, weights: Weights | None = None) -> MapState:
@@ -114,28 +126,27 @@ def update_by_tensors(stored: MapState, inputs: Inputs, cfg: ElevationMapConfig,
 
 
 def update_in_place(
-    stored: MapState, inputs: Inputs, cfg: ElevationMapConfig, weights: Weights | None, key: int
+    stored: MapState,
+    inputs: Inputs,
+    levels: StoredLevels | None = None,
+    *,
+    cfg: ElevationMapConfig,
+    weights: Weights | None,
+    key: int,
 ) -> None:
-    """Do the same in place: by one call of C++ on a CPU, by kernels on a GPU. `key` is that of `register_stages`."""
+    """Do the same in place: by one call of C++ on a CPU, that of levels too, by kernels on a GPU.
+
+    `key` is that of `register_stages`.
+    """
     tensors = (*stored[:-1], *stored.statistics)
     values = as_inputs(inputs._asdict() | {"own": find_own(inputs, cfg.sensor)})
     if stored.elevation.is_cuda:
         with torch.cuda.device_of(stored.elevation):
             cuda_stages(cfg).run(tensors, values)
     else:
-        cpu_update.run(key, tensors, values)
+        cpu_update.run(key, tensors, values, levels or ())
     if isinstance(cfg.traversability, LearnedTraversabilityConfig):
         write(stored, rate_learned(stored, cfg, weights))
-
-
-def recenter_in_place(stored: MapState, inputs: Inputs, cfg: ElevationMapConfig, key: int) -> None:
-    """Move the windows as an update would, in place; `key` is that of `register_stages`, or -1 for tensors."""
-    no_points = inputs._replace(points=inputs.points[:, :, :0], variance=None, T_base_links=None)
-    if key < 0:
-        m = measure(*no_points, cfg.grid, dataclasses.replace(cfg.sensor, body=None), stored.elevation.dtype)
-        return write(stored, recenter(stored, m, cfg.grid))
-    values = as_inputs(no_points._asdict() | {"own": None})
-    cpu_update.compiled_stages(key).run((*stored[:-1], *stored.statistics), values, ("measure", "recenter"))
 
 
 @functools.lru_cache(maxsize=64)
@@ -158,7 +169,8 @@ def register_stages(cfg: ElevationMapConfig) -> int:
     """Return the key of the C++ stages for a config; they are built when they first run. -1 if only tensors run it."""
     if only_by_tensors(cfg):
         return -1
-    return cpu_update.register(CpuUpdate(KERNELS, TENSORS, ORDER, cfg, ElevationMapConfig()))
+    order = ORDER_WITH_LEVELS if cfg.has_levels else ORDER
+    return cpu_update.register(CpuUpdate(KERNELS, TENSORS, order, cfg, ElevationMapConfig()))
 
 
 def write(stored: MapState, new: MapState) -> None:

@@ -10,7 +10,6 @@ from torchelev.config import ElevationMapConfig
 from torchelev.kernels.cpu_build import AHEAD, build_ahead
 from torchelev.kernels.cpu_update import compiled_stages
 from torchelev.kernels.registry import PACKAGE
-from torchelev.levels.native import LIBRARY as LEVELS
 from torchelev.observations.image_kernel import LIBRARY as IMAGES
 from torchelev.observations.scan_kernel import LIBRARY as SCANS
 from torchelev.observations.voxel_kernel import LIBRARY as VOXELS
@@ -29,7 +28,7 @@ def main() -> None:
     """Build all libraries for each instruction set of this machine's kind."""
     shutil.rmtree(AHEAD, ignore_errors=True)
     stages = compiled_stages(register_stages(ElevationMapConfig())).parts
-    others = (CASTING, CHANNELS, DIJKSTRA, ERRORS, HEIGHTS, IMAGES, LEVELS, OWN_POINTS, SCANS, VIEWS, VOXELS)
+    others = (CASTING, CHANNELS, DIJKSTRA, ERRORS, HEIGHTS, IMAGES, OWN_POINTS, SCANS, VIEWS, VOXELS)
     for library in (stages, *others, library_parts()):
         for path in build_ahead(*library):
             print(path.name)

@@ -74,19 +74,25 @@ class CpuUpdate:
         return settings_of(self._kernels, self._cfg, self._default)
 
     def run(
-        self, state: Sequence[Tensor], inputs: Sequence[Tensor | None], stages: Sequence[str] | None = None
+        self,
+        state: Sequence[Tensor],
+        inputs: Sequence[Tensor | None],
+        stages: Sequence[str] | None = None,
+        levels: Sequence[Tensor] = (),
     ) -> None:
-        """Run stages, by name, or all, on a state's tensors (B, ...), in place.
+        """Run stages, by name, or all, on a state's tensors (B, ...) and those of its levels, if any, in place.
 
         Raises:
             MemoryError: without enough memory. Some maps then lack a part of this update.
         """
         assert self.library is not None
-        sizes = sizes_of(state, inputs)
+        sizes = sizes_of(state, inputs, levels)
         functions = self._addresses(self._order if stages is None else tuple(stages))
-        arguments = addresses(state), addresses(inputs), self._settings, sizes
-        references = (ctypes.byref(value) for value in arguments)
-        torch.autograd.graph.increment_version(state)  # a backward pass through what the maps held shall say so
+        arguments = addresses(state), addresses(inputs), addresses(levels) if levels else None, self._settings, sizes
+        references = (None if value is None else ctypes.byref(value) for value in arguments)
+        torch.autograd.graph.increment_version(
+            [*state, *levels]
+        )  # a backward pass through what the maps held shall say so
         call(self.library.update_maps, *references, functions, ctypes.c_int64(len(functions)), torch.get_num_threads())
 
     def _addresses(self, stages: tuple[str, ...]) -> Any:
@@ -122,30 +128,32 @@ def is_built(key: int) -> bool:
 is_built._dynamo_marked_constant = True  # type: ignore[attr-defined]
 
 
-def run(key: int, state: Sequence[Tensor], inputs: Inputs) -> None:
+def run(key: int, state: Sequence[Tensor], inputs: Inputs, levels: Sequence[Tensor] = ()) -> None:
     """Run all stages in place; inside a `torch.compile` of the user's own as one operator of its graph."""
     if torch.compiler.is_compiling():
-        torch.ops.torchelev.update_maps(list(state), list(inputs), key)
+        torch.ops.torchelev.update_maps(list(state), list(inputs), list(levels), key)
     else:
-        _UPDATES[key].run(state, inputs)
+        _UPDATES[key].run(state, inputs, levels=levels)
 
 
-LIBRARY.define("update_maps(Tensor(a!)[] state, Tensor?[] inputs, int key) -> ()")
-LIBRARY.impl("update_maps", lambda state, inputs, key: _UPDATES[key].run(state, inputs), "CPU")
-torch.library.register_fake("torchelev::update_maps", lambda state, inputs, key: None, lib=LIBRARY)
+LIBRARY.define("update_maps(Tensor(a!)[] state, Tensor?[] inputs, Tensor(b!)[] levels, int key) -> ()")
+LIBRARY.impl("update_maps", lambda state, inputs, levels, key: _UPDATES[key].run(state, inputs, levels=levels), "CPU")
+torch.library.register_fake("torchelev::update_maps", lambda state, inputs, levels, key: None, lib=LIBRARY)
 
 _LINKS = Inputs._fields.index("T_base_links")
 
 
-def sizes_of(state: Sequence[Tensor], inputs: Sequence[Tensor | None]) -> Sizes:
-    """Return the sizes of a state's tensors and their inputs."""
+def sizes_of(state: Sequence[Tensor], inputs: Sequence[Tensor | None], levels: Sequence[Tensor] = ()) -> Sizes:
+    """Return the sizes of a state's tensors, of their inputs and of their levels."""
     points, links = inputs[0], inputs[_LINKS]
     assert points is not None
     S, N = points.shape[1:3]
-    return Sizes(*state[_ELEVATION].shape, S, N, 0 if links is None else links.shape[1], S * N, S if S > 1 else 0)
+    K, L = 0 if links is None else links.shape[1], levels[_LOWER].shape[1] if levels else 0
+    return Sizes(*state[_ELEVATION].shape, S, N, K, S * N, S if S > 1 else 0, L)
 
 
 _ELEVATION = 4  # place of the elevation among a state's tensors
+_LOWER = 1  # place of a layer (B, L, H, W) among the tensors of levels
 
 
 def addresses(tensors: Sequence[Tensor | None]) -> ctypes.Array[ctypes.c_void_p]:

@@ -11,7 +11,7 @@ Number = bool | int | float
 Settings = Mapping[str, Number | tuple[Number, ...]]
 
 _TYPES = {"Float": "float", "Float64": "double", "Int": "int64_t", "Bool": "uint8_t", "UInt8": "uint8_t"}
-SIZES = ("B", "H", "W", "S", "N", "K", "M", "P")  # M = S * N; P = S if several sensors are compared, else 0
+SIZES = ("B", "H", "W", "S", "N", "K", "M", "P", "L")  # M = S * N; P = S if several sensors are compared, else 0
 _LARGEST = 2**31 - 1  # C's settings are integers of 32 bits
 
 

@@ -43,13 +43,13 @@ struct Borrowed {
 extern "C" void forget_memory() { kept = new Kept; }
 
 // Run stages in their order on maps and their inputs, in place. Returns what `code_of` does.
-extern "C" int update_maps(const MapState* state, const Inputs* inputs, const Settings* settings, const Sizes* sizes,
-                           const Stage* stages, int64_t num_stages, int num_threads) {
+extern "C" int update_maps(const MapState* state, const Inputs* inputs, const StoredLevels* levels, const Settings* settings,
+                           const Sizes* sizes, const Stage* stages, int64_t num_stages, int num_threads) {
     auto make = [] { return Borrowed(); };
     auto update = [&](int64_t b, int threads, Borrowed& borrowed) {
         Own& own = *borrowed.own;
         Update one{*settings,          *sizes,     state->at(b, *sizes), inputs->at(b, *sizes),
-                   own.measurement,    own.memory, threads};
+                   own.measurement,    own.memory, threads,              levels ? levels->at(b, *sizes) : StoredLevels{}};
         run_stages(one, stages, num_stages);
     };
     return code_of([&] { for_environments(sizes->B, num_threads, make, update); });

@@ -7,7 +7,7 @@
 #include <utility>
 #include <vector>
 
-#include "generated.h"  // Sizes, MapState, Statistics, Inputs and Settings, derived from their Python declarations
+#include "generated.h"  // Sizes, MapState, StoredLevels, Inputs and Settings, derived from their Python declarations
 #include "kernels/threads.h"
 
 // Memory for numbers that are written before they are read; it only grows.
@@ -69,12 +69,13 @@ typedef void (*Stage)(Update&);
 
 struct Update {
     const Settings& settings;
-    const Sizes& sizes;       // B, H, W, S, N, K, M, P: see structs.py
+    const Sizes& sizes;       // B, H, W, S, N, K, M, P, L: see structs.py
     MapState state;           // this map's: layers (H, W), numbers behind pointers
     Inputs inputs;            // this map's
     Measurement& measurement;
     Memory& memory;           // of this thread
     int threads;              // that may work on this map
+    StoredLevels levels = {};    // this map's, of L surfaces; null without
     Stage on_failure = nullptr;  // puts back what a stage took out of the map for those that follow
 
     int64_t cells() const { return sizes.H * sizes.W; }

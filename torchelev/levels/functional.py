@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from torchelev.errors import require
-from torchelev.levels.state import Levels, move, rises
+from torchelev.levels.state import Levels, move, raise_surfaces
 from torchelev.levels.step import update_levels
 from torchelev.stages.measure.stage import set_aside
 from torchelev.stages.recenter.stage import recenter
@@ -38,8 +38,7 @@ def forward(
     step = update_levels(move(levels, moved.corner - state.corner), moved, m, cfg)
     state, levels = run(step.state, set_aside(m, step.aside)), step.levels
     if cfg.drift is not None:
-        steps = rises(state.statistics.drift_correction.to(levels.lower.dtype))
-        levels = levels._replace(**{name: getattr(levels, name) + step for name, step in steps.items()})
+        levels = raise_surfaces(levels, state.statistics.drift_correction.to(levels.lower.dtype))
     return state, levels
 
 

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, cast
 
 import torch
 from torch import Tensor, nn
 
-from torchelev.kernels.cpu_build import load
-from torchelev.levels import native
+from torchelev.levels.compiled import StoredLevels
 from torchelev.levels.state import (
     SURFACE,
     Levels,
@@ -17,13 +15,14 @@ from torchelev.levels.state import (
     blank_levels,
     forget_space,
     move,
+    raise_surfaces,
     remove,
-    rises,
     turn,
 )
 from torchelev.levels.step import update_levels
 from torchelev.levels.views import View, view
 from torchelev.stages.measure.stage import measure
+from torchelev.stages.recenter.stage import recenter
 from torchelev.state import MapState, blank_corner, fill, map_layers
 
 if TYPE_CHECKING:
@@ -47,6 +46,7 @@ class MapLevels(nn.Module):
     upper: Tensor
     free_top: Tensor
     is_open: Tensor
+    last_numbers: Tensor
 
     def __init__(self, cfg: ElevationMapConfig, num_envs: int, device: torch.device | str) -> None:
         super().__init__()
@@ -56,14 +56,8 @@ class MapLevels(nn.Module):
         self.register_buffer("corner", torch.tensor(blank_corner(cfg.grid), device=device).repeat(num_envs, 1))
         for name, value in blank_levels(size, device)._asdict().items():
             self.register_buffer(name, value)
-        for name in LevelStatistics._fields:
-            number = torch.zeros(num_envs, dtype=torch.int64, device=device)
-            self.register_buffer(f"last_{name}", number, persistent=False)
-
-    def build(self) -> None:
-        """Build the C++ of these levels, if they run it."""
-        if self.corner.is_cpu:
-            load(*native.LIBRARY)
+        numbers = torch.zeros(num_envs, len(LevelStatistics._fields), dtype=torch.int64, device=device)
+        self.register_buffer("last_numbers", numbers, persistent=False)
 
     @property
     def stored(self) -> Levels:
@@ -73,40 +67,39 @@ class MapLevels(nn.Module):
     @property
     def statistics(self) -> LevelStatistics:
         """What the last update did, as fresh (B,) tensors."""
-        return LevelStatistics(*(getattr(self, f"last_{name}").clone() for name in LevelStatistics._fields))
+        return LevelStatistics(*self.last_numbers.clone().unbind(1))
+
+    @property
+    def compiled(self) -> StoredLevels:
+        """The buffers as compiled code updates them, in place."""
+        return StoredLevels(self.corner, *self.stored, self.last_numbers)
 
     @torch.no_grad()
-    def sort_points(self, state: MapState, inputs: Inputs, recenter: Callable[[MapState, Inputs], None]) -> Inputs:
-        """Take the points of other surfaces out of an update, and choose the ground; see `update_levels`.
+    def sort_points(self, state: MapState, inputs: Inputs) -> Inputs:
+        """Take the points of other surfaces out of an update, and choose the ground, by tensors; see `update_levels`.
 
         Args:
             state: of the maps before the update, which is recentred, in place.
             inputs: of the update.
-            recenter: moves the windows of a state as the update will, in place.
 
         Returns:
             The inputs with `aside`.
         """
-        if native.can_update(self.stored, state, self.cfg):
-            recenter(state, inputs)
-            aside, statistics = native.update_in_cpp(self.stored, self.corner, state, inputs, self.cfg)
-        else:
-            m = measure(*inputs, self.cfg.grid, self.cfg.sensor, state.elevation.dtype)
-            recenter(state, inputs)
-            step = update_levels(self.in_windows(state), state, m, self.cfg)
-            map_layers(lambda old, new: old if new is old else old.copy_(new), state, step.state)
-            self._write(step.levels, state.corner)
-            aside, statistics = step.aside.view(inputs.points.shape[:3]), step.statistics
-        for name, number in statistics._asdict().items():
-            getattr(self, f"last_{name}").copy_(number)
-        return inputs._replace(aside=aside)
+        m = measure(*inputs, self.cfg.grid, self.cfg.sensor, state.elevation.dtype)
+        moved = recenter(state, m, self.cfg.grid)
+        step = update_levels(move(self._in_rows(), moved.corner - self.corner), moved, m, self.cfg)
+        map_layers(lambda old, new: old if new is old else old.copy_(new), state, step.state)
+        self._write(step.levels, state.corner)
+        self.last_numbers.copy_(torch.stack(step.statistics, 1))
+        return inputs._replace(aside=step.aside.view(inputs.points.shape[:3]))
 
     @torch.no_grad()
     def follow_drift(self, state: MapState) -> None:
         """Raise all surfaces as drift compensation raised the ground in an update."""
         if self.cfg.drift is not None:
-            for name, step in rises(state.statistics.drift_correction.float()).items():
-                getattr(self, name).add_(step)
+            raised = raise_surfaces(self.stored, state.statistics.drift_correction.to(self.lower.dtype))
+            for name in ("lower", "upper", "free_top"):
+                getattr(self, name).copy_(getattr(raised, name))
 
     @torch.no_grad()
     def follow(self, state: MapState) -> None:
@@ -120,7 +113,11 @@ class MapLevels(nn.Module):
 
     def in_windows(self, state: MapState) -> Levels:
         """Return the levels in the windows of a state of the maps, as `ElevationMap.forward` takes them."""
-        return move(turn(self.stored, self.corner, to_ring=False), state.corner - self.corner)
+        return move(self._in_rows(), state.corner - self.corner)
+
+    def _in_rows(self) -> Levels:
+        """Return the levels in the windows that they were stored in."""
+        return turn(self.stored, self.corner, to_ring=False)
 
     def _write(self, new: Levels, corner: Tensor) -> None:
         """Store levels of windows with this corner."""

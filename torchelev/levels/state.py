@@ -89,10 +89,11 @@ def age(levels: Levels, dt: Float[Tensor, "B"], variance_rate: float, max_varian
     )
 
 
-def rises(height: Float[Tensor, "B"]) -> dict[str, Tensor]:
-    """Return by how much each layer of heights rises [m], as drift compensation raises the ground."""
-    of_cells, of_surfaces = height[:, None, None], height[:, None, None, None]
-    return {"lower": of_surfaces, "upper": of_surfaces, "free_top": of_cells}
+def raise_surfaces(levels: Levels, height: Float[Tensor, "B"]) -> Levels:
+    """Return levels raised by a height [m] of each map, as drift compensation raises the ground."""
+    step = torch.where(levels.support > 0, height[:, None, None, None], 0.0)
+    free_top = levels.free_top + height[:, None, None]
+    return levels._replace(lower=levels.lower + step, upper=levels.upper + step, free_top=free_top)
 
 
 def forget_space(levels: Levels, cells: Tensor) -> Levels:

@@ -59,7 +59,7 @@ class ReadableMap(MapBuffers):
             if cfg.channels:
                 self.channels = Channels(cfg.channels, cfg.grid, cfg.sensor, num_envs, device)
             self.levels = None
-            if cfg.levels is not None and cfg.levels.others:
+            if cfg.has_levels:
                 self.levels = MapLevels(cfg, num_envs, device)
         if self.head is not None:
             self.head.to(device)

@@ -25,7 +25,7 @@ from torchelev.levels.config import MAX_HEIGHT, MAX_LEVELS, SEPARATIONS
 from torchelev.observations import presets
 from torchelev.observations.ground import MARGIN, MAX_BLOCK
 from torchelev.observations.height_scan import HeightScan
-from torchelev.pipeline import KERNELS, ORDER, TENSORS
+from torchelev.pipeline import KERNELS, ORDER, ORDER_WITH_LEVELS, TENSORS
 from torchelev.plane_fit import MAX_RADIUS
 from torchelev.robot import RobotConfig
 from torchelev.robot_body.shapes import RobotBody
@@ -230,9 +230,10 @@ def _annotation(name: str) -> Any:
 
 
 def _order() -> str:
-    declared = "\n".join(f"void run_{name}(Update&);" for name in ORDER)
-    stages = ", ".join(f"run_{name}" for name in ORDER)
-    return f'extern "C" {{\n{declared}\n}}\nconstexpr Stage ORDER[] = {{{stages}}};\n'
+    declared = "\n".join(f"void run_{name}(Update&);" for name in ORDER_WITH_LEVELS)
+    orders = ("ORDER", ORDER), ("ORDER_WITH_LEVELS", ORDER_WITH_LEVELS)
+    lists = "".join(_table("Stage", name, (f"run_{stage}" for stage in order)) for name, order in orders)
+    return f'extern "C" {{\n{declared}\n}}\n{lists}'
 
 
 # Height scans -------------------------------------------------------------------------------------------------------

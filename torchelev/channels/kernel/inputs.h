@@ -4,7 +4,7 @@
 #include <cstdint>
 
 #include "channels/kernel/equation.h"
-#include "kernels/places.h"
+#include "channels/kernel/places.h"
 
 namespace channels {
 

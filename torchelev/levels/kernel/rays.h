@@ -3,14 +3,16 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <vector>
 
-#include "levels/kernel/update.h"
+#include "generated.h"
+#include "levels/kernel/points.h"
 #include "stages/visibility/azimuth.h"
 
 namespace levels {
 
-using places::INFINITE;
+constexpr float INFINITE = std::numeric_limits<float>::infinity();
 constexpr float MARGIN = 1.5f, NEAREST = 3.0f;
 constexpr int MAX_WINDOW = 8;
 constexpr float HEIGHTS[] = {0.3f, 0.5f, 0.7f};
@@ -21,9 +23,9 @@ struct SightGrid {
     int32_t azimuths, elevations, ranges;
     float resolution, window;  // window: of a cell at 1 m [bins]
 
-    explicit SightGrid(const Update& u)
-        : azimuths(u.azimuths), elevations(u.elevations), ranges(u.ranges), resolution(float(u.resolution)),
-          window(float(0.75 * u.resolution * u.azimuths / (2 * 3.14159265358979323846))) {}
+    explicit SightGrid(const LevelsSettings& s)
+        : azimuths(s.azimuths), elevations(s.elevations), ranges(s.ranges), resolution(float(s.resolution)),
+          window(float(0.75 * s.resolution * s.azimuths / (2 * 3.14159265358979323846))) {}
 
     int32_t azimuth_bin(float x, float y) const {
         const int32_t bin = int32_t(visibility::azimuth_fraction(x, y) * float(azimuths));

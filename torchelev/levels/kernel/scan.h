@@ -1,114 +1,112 @@
-// Measuring a scan: where its points lie, and what its rays saw.
+// Where the points of a scan lie, and what its rays saw.
 #pragma once
 
 #include "levels/kernel/map.h"
+#include "stages/window.h"
 
 namespace levels {
 
 struct Scan : Map {
     using Map::Map;
 
-    void measure(const places::Origin& origin) {
-        own.points.resize(M);
-        bool is_sound = origin.is_sound;
-        for (int64_t k = 0; k < 12 * u.S; k++) is_sound &= std::isfinite(u.T_map_sensor[16 * (b * u.S + k / 12) + k % 12]);
-        has_base = origin.has_base && is_sound;
-        std::copy_n(origin.base, 3, base);
-        for (int64_t s = 0; s < u.S; s++) {
-            const places::Frame frame(u, b, u.T_map_sensor + 16 * (b * u.S + s), origin);
-            std::copy_n(frame.t, 3, own.sights[s].origin);
-            if (!is_sound) {
-                std::fill_n(own.points.cell.begin() + s * u.N, u.N, -1), std::fill_n(own.points.casts.begin() + s * u.N, u.N, 0);
-                continue;
-            }
-            const int64_t blocks = (u.N + BLOCK - 1) / BLOCK;
+    void find_points() {
+        find_centers();
+        own.sights.resize(S);
+        for (int64_t k = 0; k < S; k++) std::copy_n(&measured.origin[3 * k], 3, own.sights[k].origin);
+        sights.size.ranges = std::min(sights.size.ranges, reach());
+        own.points.resize(M), own.points.casts = measured.casts.data(), own.points.used = measured.used.data();
+        const Window window(ground.corner, measured.anchor, u.sizes, float(s.resolution));
+        const int64_t blocks = (N + BLOCK - 1) / BLOCK;
+        for (int64_t sensor = 0; sensor < S; sensor++) {
+            const float* const origin = own.sights[sensor].origin;
             parts(blocks, [&](int64_t, int64_t begin, int64_t end) {
                 for (int64_t k = begin; k < end; k++)
-                    measure_block(s * u.N + k * BLOCK, std::min(BLOCK, u.N - k * BLOCK), frame, sights.size);
+                    find_block(sensor * N + k * BLOCK, std::min(BLOCK, N - k * BLOCK), origin, window, sights.size);
             });
-        }
-        const int64_t* anchor = origin.anchor;
-        own.x.resize(u.H), own.y.resize(u.W);
-        const int64_t sizes[] = {u.H, u.W};
-        for (int axis = 0; axis < 2; axis++) {
-            const int64_t away = std::clamp(u.corner[2 * b + axis] - anchor[axis], -places::FAR, places::FAR);
-            std::vector<float>& centers = axis ? own.y : own.x;
-            for (int64_t k = 0; k < sizes[axis]; k++)
-                centers[k] = (float(k) + (float(away) + 0.5f)) * float(u.resolution);
         }
     }
 
-    void measure_block(int64_t begin, int64_t number, const places::Frame& of_sensor, const SightGrid& of_map) {
-        const places::Frame frame = of_sensor;  // copies that nothing else can change: the loops become vectors
-        const SightGrid size = of_map;
-        const int64_t first = b * M + begin;
-        const float *p = u.points + 3 * first, *variance = u.variance ? u.variance + first : nullptr;
-        const uint8_t* is_own = u.own ? u.own + first : nullptr;
-        float x[BLOCK] = {}, y[BLOCK] = {}, z[BLOCK] = {}, ax[BLOCK], ay[BLOCK], az[BLOCK], noise[BLOCK];
-        float rho[BLOCK], slope[BLOCK];
+    void find_centers() {
+        const int64_t sizes[] = {H, W};
+        for (int axis = 0; axis < 2; axis++) {
+            std::vector<float>& centers = axis ? own.y : own.x;
+            centers.resize(sizes[axis]);
+            for (int64_t k = 0; k < sizes[axis]; k++)
+                centers[k] = center_offset(ground.corner, measured.anchor, axis, k, float(s.resolution));
+        }
+    }
+
+    // How many rows of the table of slopes the cells ask for: `row_behind`, and one that stays blank.
+    int32_t reach() const {
+        float farthest = 0;
+        for (const Sight& sight : own.sights)
+            for (const float x : {own.x.front(), own.x.back()})
+                for (const float y : {own.y.front(), own.y.back()})
+                    farthest = std::max(farthest, horizontal(x - sight.origin[0], y - sight.origin[1]));
+        return sights.size.row_behind(farthest) + 2;
+    }
+
+    void find_block(int64_t begin, int64_t number, const float* origin, const Window& of_map, const SightGrid& of_rays) {
+        const Window window = of_map;  // copies that nothing else can change: the loops become vectors
+        const SightGrid size = of_rays;
+        const float from[] = {origin[0], origin[1], origin[2]};
+        float x[BLOCK] = {}, y[BLOCK] = {}, z[BLOCK] = {}, rho[BLOCK], slope[BLOCK];
         int32_t cell[BLOCK], direction[BLOCK], reach[BLOCK];
-        uint8_t casts[BLOCK], above[BLOCK] = {};
-        for (int64_t n = 0; n < number; n++) x[n] = p[3 * n], y[n] = p[3 * n + 1], z[n] = p[3 * n + 2];
+        uint8_t casts[BLOCK] = {};
+        std::copy_n(&measured.x[begin], number, x), std::copy_n(&measured.y[begin], number, y);
+        std::copy_n(&measured.z[begin], number, z), std::copy_n(&measured.casts[begin], number, casts);
         for (int64_t n = 0; n < BLOCK; n++) {
-            const float d2 = x[n] * x[n] + y[n] * y[n] + z[n] * z[n];
-            casts[n] = (d2 >= frame.nearest2) & (d2 <= frame.farthest2);
-            frame.place(x[n], y[n], z[n], ax[n], ay[n], az[n], cell[n], noise[n]);
-        }
-        for (int64_t n = 0; variance && n < number; n++) {
-            casts[n] &= (variance[n] >= TINY) & (variance[n] < INFINITE);
-            noise[n] = casts[n] ? variance[n] : 1.0f;
-        }
-        for (int64_t n = 0; !u.own && u.has_box && u.T_map_base && n < BLOCK; n++)
-            casts[n] &= !frame.is_inside(ax[n], ay[n], az[n], u.box);
-        for (int64_t n = 0; is_own && n < number; n++) casts[n] &= !is_own[n];
-        for (int64_t n = 0; u.has_ramp && n < BLOCK; n++) above[n] = frame.is_above(ax[n], ay[n], az[n], u.ramp);
-        for (int64_t n = 0; n < BLOCK; n++) {
-            const float dx = casts[n] ? ax[n] - frame.t[0] : 0, dy = casts[n] ? ay[n] - frame.t[1] : 0;
-            const float dz = casts[n] ? az[n] - frame.t[2] : 0;
+            const int32_t slot = window.slot(x[n], y[n]);
+            cell[n] = casts[n] ? slot : -1;
+            const float dx = casts[n] ? x[n] - from[0] : 0, dy = casts[n] ? y[n] - from[1] : 0;
+            const float dz = casts[n] ? z[n] - from[2] : 0;
             const int32_t azimuth = size.azimuth_bin(dx, dy);
             rho[n] = horizontal(dx, dy), slope[n] = dz / std::max(rho[n], 1e-12f);
             direction[n] = size.elevation_bin(rho[n], dz) * size.azimuths + azimuth;
             reach[n] = size.range_bin(rho[n]) * size.azimuths + azimuth;
         }
         Points& to = own.points;
-        for (int64_t n = 0; n < number; n++) {
-            const int64_t m = begin + n;
-            to.z[m] = az[n], to.noise[m] = noise[n], to.rho[m] = rho[n], to.slope[m] = slope[n];
-            to.direction[m] = direction[n], to.reach[m] = reach[n];
-            to.cell[m] = casts[n] ? cell[n] : -1, to.casts[m] = casts[n], to.above[m] = above[n];
-        }
+        std::copy_n(rho, number, &to.rho[begin]), std::copy_n(slope, number, &to.slope[begin]);
+        std::copy_n(direction, number, &to.direction[begin]), std::copy_n(reach, number, &to.reach[begin]);
+        std::copy_n(cell, number, &to.cell[begin]);
     }
 
     // Make the tables of the rays, and the extremes of the points of each cell.
     void look() {
-        for_each(int(2 * u.S + 1), parts.num_threads, [&](int task) {
-            if (task == 2 * u.S) return span_cells();
+        for_each(int(2 * S + 1), parts.num_threads, [&](int task) {
+            if (task == 2 * S) return span_cells();
             Sight& sight = own.sights[task / 2];
-            const int64_t begin = (task / 2) * u.N, end = begin + u.N;
+            const int64_t begin = (task / 2) * N, end = begin + N;
             if (task % 2) sight.look_for_nearest(own.points, begin, end, sights.size);
             else sight.look_for_slopes(own.points, begin, end, sights.size);
         });
         own.highest.resize(cells), own.lowest.resize(cells);
-        parts(u.H, [&](int64_t, int64_t begin, int64_t end) {
+        parts(H, [&](int64_t, int64_t begin, int64_t end) {
             for (int64_t i = begin; i < end; i++)
-                sights.heights(own.x[i], own.y.data(), u.W, &own.highest[i * u.W], &own.lowest[i * u.W]);
+                sights.heights(own.x[i], own.y.data(), W, &own.highest[i * W], &own.lowest[i * W]);
         });
     }
 
     void span_cells() {
         own.bottom.resize(cells), own.top.resize(cells), own.all_above.resize(cells);
-        own.number.assign(cells, 0), own.touched.clear(), own.touched.reserve(std::min(cells, M));
+        own.number.assign(cells, 0), own.touched.resize(cells + 1);
         for (int64_t m = 0; m < M; m++) {
             const int32_t c = own.points.cell[m];
             if (c < 0) continue;
-            const float z = own.points.z[m];
+            const float z = measured.z[m];
+            const uint8_t above = !own.points.used[m];
             if (own.number[c]++ == 0) {
-                own.touched.push_back(c), own.bottom[c] = own.top[c] = z, own.all_above[c] = own.points.above[m];
+                own.bottom[c] = own.top[c] = z, own.all_above[c] = above;
             } else {
                 own.bottom[c] = std::min(own.bottom[c], z), own.top[c] = std::max(own.top[c], z);
-                own.all_above[c] &= own.points.above[m];
+                own.all_above[c] &= above;
             }
         }
+        int32_t* const touched = own.touched.data();
+        const int32_t* const number = own.number.data();
+        int64_t count = 0;
+        for (int32_t c = 0; c < int32_t(cells); c++) touched[count] = c, count += number[c] > 0;
+        own.num_touched = count;
     }
 };
 

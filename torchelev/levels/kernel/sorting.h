@@ -25,23 +25,23 @@ struct Sorting : Scan {
 
     // Whether all points of a cell are its ground's, or could become it: most are.
     bool is_simple(int64_t c) const {
-        if (own.had_levels[place(c)]) return false;
+        if (own.had_levels[c]) return false;
         const float low = own.bottom[c], high = own.top[c];
-        if (!u.validity[b * cells + c]) return high - low <= u.min_gap && !own.all_above[c] && !floats(c, low);
-        const float g = u.elevation[b * cells + c];
-        return g - low <= u.min_gap && high - g <= u.min_gap && !floats(c, g);
+        if (!ground.validity[c]) return high - low <= s.min_gap && !own.all_above[c] && !floats(c, low);
+        const float g = ground.elevation[c];
+        return g - low <= s.min_gap && high - g <= s.min_gap && !floats(c, g);
     }
 
     void sort_points() {
-        std::fill_n(u.aside + b * M, M, 0);
+        own.is_aside.assign(M, 0);
         own.list.assign(cells, -1), own.complex.clear(), own.first.assign(1, 0);
         const int64_t most = std::min(cells, M);  // reserved at once: later updates of this size allocate nothing
         for (std::vector<int32_t>* values : {&own.complex, &own.first, &own.next}) values->reserve(most + 1);
         own.simple.resize(most), own.waiting.reserve(most), own.sorted.resize(M), own.clusters.resize(parts.number);
-        parts(int64_t(own.touched.size()), [&](int64_t, int64_t begin, int64_t end) {
+        parts(own.num_touched, [&](int64_t, int64_t begin, int64_t end) {
             for (int64_t k = begin; k < end; k++) own.simple[k] = is_simple(own.touched[k]);
         });
-        for (size_t k = 0; k < own.touched.size(); k++) {
+        for (int64_t k = 0; k < own.num_touched; k++) {
             const int32_t c = own.touched[k];
             if (own.simple[k]) continue;
             own.list[c] = int32_t(own.complex.size()), own.complex.push_back(c);
@@ -58,7 +58,7 @@ struct Sorting : Scan {
         parts(int64_t(own.complex.size()), [&](int64_t part, int64_t begin, int64_t end) {
             int64_t of_part[STATISTICS] = {};
             for (int64_t k = begin; k < end; k++) {
-                find_clusters(own.first[k], own.first[k + 1], own.clusters[part]);
+                find_clusters(own.complex[k], own.first[k], own.first[k + 1], own.clusters[part]);
                 sort_cell(own.complex[k], own.clusters[part], own.waiting[k], of_part);
             }
             opened += of_part[OPENED], dropped += of_part[DROPPED];
@@ -66,9 +66,9 @@ struct Sorting : Scan {
         statistics[OPENED] += opened, statistics[DROPPED] += dropped;
     }
 
-    // The clusters of a cell from below: `find_clusters`.
-    void find_clusters(int64_t begin, int64_t end, std::vector<Cluster>& clusters) {
-        const std::vector<float>& z = own.points.z;
+    // Sort points of a cell by height.
+    void sort(int64_t begin, int64_t end) {
+        const float* const z = measured.z.data();
         const auto is_lower = [&](int32_t a, int32_t c) { return z[a] < z[c]; };
         int32_t* const order = own.sorted.data();
         if (end - begin > FEW) {
@@ -82,28 +82,36 @@ struct Sorting : Scan {
                 order[to] = m;
             }
         }
+    }
+
+    // The clusters of a cell from below: `find_clusters`.
+    void find_clusters(int32_t c, int64_t begin, int64_t end, std::vector<Cluster>& clusters) {
+        const float* const z = measured.z.data();
+        const bool has_gaps = own.top[c] - own.bottom[c] > s.min_gap;  // there may be some
+        if (has_gaps) sort(begin, end);
         clusters.clear();
         for (int64_t k = begin; k < end; k++) {
             const int32_t m = own.sorted[k];
-            if (k == begin || z[m] - z[own.sorted[k - 1]] > u.min_gap) {
+            if (k == begin || (has_gaps && z[m] - z[own.sorted[k - 1]] > s.min_gap)) {
                 clusters.emplace_back();
-                clusters.back().lower = z[m], clusters.back().begin = k;
+                clusters.back().lower = has_gaps ? z[m] : own.bottom[c], clusters.back().upper = z[m];
+                clusters.back().begin = k;
             }
             Cluster& last = clusters.back();
-            const float w = 1 / own.points.noise[m];
-            last.upper = z[m], last.end = k + 1, last.weight += w, last.lift += w * (z[m] - last.lower), last.number++;
-            last.above &= own.points.above[m];
+            const float w = 1 / measured.noise[m];
+            last.upper = std::max(last.upper, z[m]), last.end = k + 1, last.weight += w, last.lift += w * (z[m] - last.lower), last.number++;
+            last.above &= !own.points.used[m];
         }
     }
 
     // `_shows_ground`
     bool shows_ground(const std::vector<Cluster>& clusters, float g) const {
-        const float part = 0.25f * u.min_gap;
+        const float part = 0.25f * s.min_gap;
         bool shows = false, solid = false;
         for (const Cluster& k : clusters) {
             shows |= k.lower <= g + SAME && k.upper >= g - SAME && k.lower >= g - part;
-            shows |= k.upper < g - u.min_gap;
-            solid |= k.lower < g - part && k.upper >= g - u.min_gap;
+            shows |= k.upper < g - s.min_gap;
+            solid |= k.lower < g - part && k.upper >= g - s.min_gap;
         }
         return shows && !solid;
     }
@@ -112,41 +120,41 @@ struct Sorting : Scan {
     void sort_cell(int64_t c, const std::vector<Cluster>& clusters, Waiting& waiting, int64_t* numbers) {
         const int64_t p = place(c);
         const Cell cell = cell_at(p);
-        float g = u.elevation[b * cells + c];
-        bool known = u.validity[b * cells + c];
+        float g = ground.elevation[c];
+        bool known = ground.validity[c];
         const bool ground_floats = known && floats(c, g);
         if (ground_floats && shows_ground(clusters, g)) {
-            numbers[DROPPED] += cell.insert(ground_of(c), u.ground_time[b * cells + c]);
+            numbers[DROPPED] += cell.insert(ground_of(c), ground.time[c]);
             numbers[OPENED]++, known = false, forget_ground(c), is_open(p) = 0;
         }
-        for (size_t rank = 0; rank < clusters.size() && rank < size_t(2 * (u.L + 1)); rank++) {
-            const Found found = clusters[rank].found(u.variance_floor);
+        for (size_t rank = 0; rank < clusters.size() && rank < size_t(2 * (L + 1)); rank++) {
+            const Found found = clusters[rank].found(s.variance_floor);
             const float to_ground = known ? distance(found.lower, found.upper, g, g) : INFINITE;
             int64_t nearest = 0;
             float to_level = INFINITE;
-            for (int64_t l = 0; l < u.L; l++) {
+            for (int64_t l = 0; l < L; l++) {
                 const int64_t q = l * cells;
                 if (!(cell.support[q] > 0)) continue;
                 const float away = distance(found.lower, found.upper, cell.lower[q], cell.upper[q]);
                 if (cell.support[q] < SETTLED && away > SAME) continue;
                 if (away < to_level) to_level = away, nearest = l;
             }
-            if (to_ground <= u.min_gap && to_ground <= to_level) continue;
-            if (to_level <= u.min_gap) {
+            if (to_ground <= s.min_gap && to_ground <= to_level) continue;
+            if (to_level <= s.min_gap) {
                 const bool stands = !known && !clusters[rank].above && found.lower < cell.lower[nearest * cells] && !floats(c, found.lower);
-                cell.fuse(nearest, found, u.max_support);
-                if (stands) found_ground(c, nearest), known = true, g = u.elevation[b * cells + c];
+                cell.fuse(nearest, found, s.max_support);
+                if (stands) found_ground(c, nearest), known = true, g = ground.elevation[c];
             } else {
                 const bool above = known && found.lower > g;
                 bool shown = known && !above ? ground_floats : (above && is_open(p)) || floats(c, found.lower);
-                shown |= (!known && clusters[rank].above) || (u.by_gap && (known || rank > 0));
+                shown |= (!known && clusters[rank].above) || (s.by_gap && (known || rank > 0));
                 if (!shown) {
                     if (!known && !(waiting.number > 0)) waiting = {found.mean, found.number};
                     continue;
                 }
                 numbers[DROPPED] += cell.insert(found, 0), numbers[OPENED]++;
             }
-            for (int64_t k = clusters[rank].begin; k < clusters[rank].end; k++) u.aside[b * M + own.sorted[k]] = 1;
+            for (int64_t k = clusters[rank].begin; k < clusters[rank].end; k++) own.is_aside[own.sorted[k]] = 1;
         }
     }
 };

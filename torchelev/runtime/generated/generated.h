@@ -3,7 +3,7 @@
 #include <cstdint>
 
 struct Sizes {
-    int64_t B, H, W, S, N, K, M, P;
+    int64_t B, H, W, S, N, K, M, P, L;
 };
 
 struct Statistics {
@@ -84,6 +84,31 @@ struct MapState {
         if (traversability) one.traversability += b * n.H * n.W;
         if (rated) one.rated += b * n.H * n.W;
         one.statistics = statistics.at(b, n);
+        return one;
+    }
+};
+
+struct StoredLevels {
+    int64_t* corner;
+    float* lower;
+    float* upper;
+    float* variance;
+    float* support;
+    float* time;
+    float* free_top;
+    uint8_t* is_open;
+    int64_t* numbers;
+    StoredLevels at(int64_t b, const Sizes& n) const {
+        StoredLevels one = *this;
+        if (corner) one.corner += b * 2;
+        if (lower) one.lower += b * n.L * n.H * n.W;
+        if (upper) one.upper += b * n.L * n.H * n.W;
+        if (variance) one.variance += b * n.L * n.H * n.W;
+        if (support) one.support += b * n.L * n.H * n.W;
+        if (time) one.time += b * n.L * n.H * n.W;
+        if (free_top) one.free_top += b * n.H * n.W;
+        if (is_open) one.is_open += b * n.H * n.W;
+        if (numbers) one.numbers += b * 5;
         return one;
     }
 };
@@ -237,6 +262,25 @@ struct SurfaceSettings {
     int32_t tile_memory;
 };
 
+struct LevelsSettings {
+    double resolution;
+    float variance_rate;
+    float max_variance;
+    float max_support;
+    float variance_floor;
+    float min_gap;
+    float max_step;
+    float min_support;
+    float min_time;
+    float overlap_height;
+    float overlap_radius;
+    int32_t by_gap;
+    int32_t max_blind;
+    int32_t azimuths;
+    int32_t elevations;
+    int32_t ranges;
+};
+
 struct Settings {
     MeasureSettings measure;
     RecenterSettings recenter;
@@ -247,4 +291,5 @@ struct Settings {
     VisibilitySettings visibility;
     OverlapSettings overlap;
     SurfaceSettings surface;
+    LevelsSettings levels;
 };

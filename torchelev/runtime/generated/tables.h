@@ -333,14 +333,31 @@ inline Settings default_settings() {
     s.surface.min_trace = float(0.01);
     s.surface.nowhere = float(60000.0);
     s.surface.tile_memory = 2880;
+    s.levels.resolution = 0.04;
+    s.levels.variance_rate = float(1e-07);
+    s.levels.max_variance = float(1.0);
+    s.levels.max_support = float(60.0);
+    s.levels.variance_floor = float(1e-06);
+    s.levels.min_gap = float(0.4);
+    s.levels.max_step = float(0.3);
+    s.levels.min_support = float(3.0);
+    s.levels.min_time = float(1.0);
+    s.levels.overlap_height = float(1.5);
+    s.levels.overlap_radius = float(3.0);
+    s.levels.by_gap = 0;
+    s.levels.max_blind = 12;
+    s.levels.azimuths = 512;
+    s.levels.elevations = 128;
+    s.levels.ranges = 270;
     return s;
 }
 
 extern "C" {
 void run_measure(Update&);
+void run_recenter(Update&);
+void run_sort_levels(Update&);
 void run_reset_statistics(Update&);
 void run_subtract_disagreement(Update&);
-void run_recenter(Update&);
 void run_age(Update&);
 void run_compensate(Update&);
 void run_fuse(Update&);
@@ -349,8 +366,38 @@ void run_clear_other_floors(Update&);
 void run_count_bounded(Update&);
 void run_add_disagreement(Update&);
 void run_rate_surface(Update&);
+void run_raise_levels(Update&);
 }
-constexpr Stage ORDER[] = {run_measure, run_reset_statistics, run_subtract_disagreement, run_recenter, run_age, run_compensate, run_fuse, run_clear_seen_through, run_clear_other_floors, run_count_bounded, run_add_disagreement, run_rate_surface};
+constexpr Stage ORDER[] = {
+    run_measure,
+    run_reset_statistics,
+    run_subtract_disagreement,
+    run_recenter,
+    run_age,
+    run_compensate,
+    run_fuse,
+    run_clear_seen_through,
+    run_clear_other_floors,
+    run_count_bounded,
+    run_add_disagreement,
+    run_rate_surface,
+};
+constexpr Stage ORDER_WITH_LEVELS[] = {
+    run_measure,
+    run_recenter,
+    run_sort_levels,
+    run_reset_statistics,
+    run_subtract_disagreement,
+    run_age,
+    run_compensate,
+    run_fuse,
+    run_clear_seen_through,
+    run_clear_other_floors,
+    run_count_bounded,
+    run_add_disagreement,
+    run_rate_surface,
+    run_raise_levels,
+};
 
 constexpr double ISAAC_LAB_X[] = {-0.8, -0.7000000000000001, -0.6000000000000001, -0.5, -0.4, -0.30000000000000004, -0.19999999999999996, -0.09999999999999998, 0.0, 0.09999999999999998, 0.19999999999999996, 0.30000000000000004, 0.40000000000000013, 0.5, 0.6000000000000001, 0.7, 0.8};
 constexpr double ISAAC_LAB_Y[] = {-0.5, -0.4, -0.3, -0.19999999999999996, -0.09999999999999998, 0.0, 0.10000000000000009, 0.20000000000000007, 0.30000000000000004, 0.4, 0.5};

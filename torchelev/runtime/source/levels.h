@@ -3,7 +3,7 @@
 
 #include <vector>
 
-#include "levels/kernel/update.h"
+#include "kernels/update.h"
 #include "runtime/source/config.h"
 
 // A tensor as files and readers see it.
@@ -31,21 +31,20 @@ class MapLevels {
     int64_t H, W, L;
     int64_t corner[2];  // of the window that the rings hold
     std::vector<float> lower, upper, variance, support, time, free_top;
-    std::vector<uint8_t> is_open, aside;
-    int64_t statistics[levels::STATISTICS];
-    levels::Update fixed;  // what all updates share: the settings, and the memory above
+    std::vector<uint8_t> is_open;
+    int64_t numbers[5];  // `LevelStatistics` of the last update
+    float min_gap, least_support;
 
     bool holds(const MapState& state, int64_t cell) const;     // whether a cell of the map lies in the rings' window
     int64_t place(const MapState& state, int64_t cell) const;  // of a cell of the map in the rings
     void blank(int64_t place);
 
   public:
-    MapLevels(const Config& cfg, const torchelev_limits& limits);
+    explicit MapLevels(const Config& cfg);
 
-    // Take the points of other surfaces out of an update of a recentred map, and choose its ground, in place.
-    void sort_points(const MapState& state, const Sizes& sizes, Inputs& inputs, int num_threads);
-    void follow(const MapState& state);  // to the window of a map that moved besides updates
-    void raise(float height);  // [m] as drift compensation raised the ground
+    int64_t number() const { return L; }  // of surfaces besides the ground
+    StoredLevels tensors();               // as updates change them
+    void follow(const MapState& state);   // to the window of a map that moved besides updates
     void forget();
     void forget_cell(const MapState& state, int64_t cell);
     // The underside of the lowest surface above a cell's ground [m]: `ceiling` of levels/views.py.

@@ -76,7 +76,7 @@ torchelev_map::torchelev_map(const std::string& text, const std::string& where, 
     }
     static_assert(sizeof(MapState) == sizeof addresses && std::size(STATE) == NUMBER_OF_TENSORS);
     std::memcpy(static_cast<void*>(&state), addresses, sizeof state);
-    if (cfg.has_levels()) levels = std::make_unique<MapLevels>(cfg, limits);
+    if (cfg.has_levels()) levels = std::make_unique<MapLevels>(cfg);
     if (levels)
         for (const Stored& tensor : levels->stored()) stored.push_back(tensor);
     covariance.resize(36 * limits.max_sensors);
@@ -242,7 +242,7 @@ void torchelev_map::find_own(const torchelev_input& input) {
 void torchelev_map::set_sizes(const torchelev_input& input) {
     sizes.K = input.T_base_links ? int64_t(cfg.body.links.size()) : 0;
     sizes.S = input.num_sensors, sizes.N = input.num_points, sizes.M = sizes.S * sizes.N;
-    sizes.P = sizes.S > 1 ? sizes.S : 0;
+    sizes.P = sizes.S > 1 ? sizes.S : 0, sizes.L = levels ? levels->number() : 0;
 }
 
 // The input as stages read it; what the input gives in another type is copied into the map.
@@ -266,23 +266,14 @@ Inputs torchelev_map::inputs_of(const torchelev_input& input) {
 void torchelev_map::run(const torchelev_input& input, const Stage* stages, int64_t number) {
     set_sizes(input);
     Update one{settings, sizes, state, inputs_of(input), own.measurement, own.memory, limits.num_threads};
+    if (levels) one.levels = levels->tensors();
     filters.forget();
     run_stages(one, stages, number);
 }
 
-// All stages, in whose middle levels take the points of other surfaces out: `update` of elevation_map.py.
 void torchelev_map::run_update(const torchelev_input& input) {
-    if (!levels) return run(input, ORDER, std::size(ORDER));
-    torchelev_input window = input;
-    window.num_points = 0, window.variance = nullptr, window.T_base_links = nullptr;
-    const Stage follow[] = {run_measure, run_recenter};
-    run(window, follow, std::size(follow));
-    set_sizes(input);
-    Inputs inputs = inputs_of(input);
-    levels->sort_points(state, sizes, inputs, limits.num_threads);
-    Update one{settings, sizes, state, inputs, own.measurement, own.memory, limits.num_threads};
-    run_stages(one, ORDER, std::size(ORDER));
-    if (settings.compensate.has_drift) levels->raise(*state.statistics.drift_correction);
+    if (levels) run(input, ORDER_WITH_LEVELS, std::size(ORDER_WITH_LEVELS));
+    else run(input, ORDER, std::size(ORDER));
 }
 
 // Reading ------------------------------------------------------------------------------------------------------------

@@ -124,6 +124,28 @@ void set_surface(const Config& cfg, SurfaceSettings& s) {
         s.per_critical[k] = has_head ? float(1 / cfg[std::string("traversability.") + critical[k]]) : 1.0f;
 }
 
+// Sizes of the tables of rays: `SightGrid.of`.
+void set_sight(const Config& cfg, LevelsSettings& s) {
+    const double cells = double(std::max(cfg.rows(), cfg.columns()));
+    s.azimuths = int32_t(std::min(1024.0, std::max(64.0, std::exp2(std::ceil(std::log2(PI * cells / 2))))));
+    s.elevations = s.azimuths / 4;
+    s.ranges = int32_t(std::ceil(0.75 * std::hypot(double(cfg.rows()), double(cfg.columns())))) + 4;
+}
+
+void set_levels(const Config& cfg, LevelsSettings& s) {
+    const bool has_overlap = cfg.has("overlap");
+    s.resolution = cfg["grid.resolution"], s.variance_rate = float(cfg["aging.variance_rate"]);
+    s.max_variance = float(cfg["fusion.max_variance"]), s.max_support = float(cfg["fusion.max_support"]);
+    s.variance_floor = float(cfg["fusion.scan_variance_floor"]);
+    s.min_time = cfg.has("raycast") ? float(cfg["raycast.min_time"]) : INFINITY;
+    s.overlap_height = has_overlap ? float(cfg["overlap.height"]) : 0;
+    s.overlap_radius = has_overlap ? float(cfg["overlap.radius"]) : 0;
+    set_sight(cfg, s);
+    s.min_gap = float(cfg["levels.min_gap"]), s.max_step = float(cfg["levels.max_step"]);
+    s.min_support = float(cfg["levels.min_support"]), s.by_gap = cfg.word("levels.separation") == "gap";
+    s.max_blind = int32_t(std::min(cfg["levels.max_blind"], 1e3) / cfg["grid.resolution"]);
+}
+
 }  // namespace
 
 Settings settings_of(const Config& cfg) {
@@ -136,5 +158,6 @@ Settings settings_of(const Config& cfg) {
     set_visibility(cfg, s.visibility);
     set_overlap(cfg, s.overlap);
     set_surface(cfg, s.surface);
+    set_levels(cfg, s.levels);
     return s;
 }

@@ -18,7 +18,7 @@ def settings(cfg: ElevationMapConfig) -> Settings:
     overlap = cfg.overlap or OverlapConfig()
     first_row, end_row, first_column, end_column = near_part(cfg.grid, overlap)
     return dict(
-        has_overlap=cfg.overlap is not None,
+        has_overlap=cfg.overlap is not None and not cfg.has_levels,
         resolution=float(cfg.grid.resolution),
         radius_square=float(overlap.radius**2),
         slope=float(overlap.height / overlap.radius),
