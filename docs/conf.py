@@ -27,7 +27,7 @@ nitpicky = True
 # Without a page: other libraries' names, and types of this one's that only its own functions pass on.
 _INTERNAL = (
     r"torchelev\.(observations\.patterns|planes\.local_planes|traversability\.weight_file|stages"
-    r"|filters\.registry|io\.files\.arrays|io\.folders\.clock|site\.service\.(answers|questions|transport))\."
+    r"|filters\.registry|io\.files\.arrays|io\.folders\.clock|site\.service\.(server\.answers|questions|wire\.transport))\."
 )
 nitpick_ignore_regex = [("py:obj", ".*"), ("py:.*", r"^(?!torchelev\.).*"), ("py:class", rf"{_INTERNAL}.*")]
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import training
 from benchmarks.peers import report
+from benchmarks.speed.common.workload import BPEARL, SENSORS
 from benchmarks.speed.update import tables
-from benchmarks.speed.workload import BPEARL, SENSORS
 from docs.results import GPU, SPEED, load
 from torchelev.app.results import markdown_table
 

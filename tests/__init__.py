@@ -1,1 +1,1 @@
-"""Tests, in the same rooms as what they test; `reference.py` has every equation again, as slow loops."""
+"""Tests, in the same rooms as what they test; `reference/` has every equation again, as slow loops."""

@@ -174,4 +174,4 @@ def test_stale_files_and_names_are_found():
 
 def test_names_of_all_kinds_are_known():
     text = "`ElevationMap.layer`, `T_map_base`, `fill='inpaint'`, `with`, `torch.func.vjp`, ``io.clouds``, `amax`"
-    assert missing_names(text) == [] and missing_files("grid.py, site/tiles.py and `/absent`") == []
+    assert missing_names(text) == [] and missing_files("grid.py, site/content/tiles.py and `/absent`") == []

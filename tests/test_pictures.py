@@ -11,9 +11,9 @@ import training
 from benchmarks.quality.accuracy import report
 from benchmarks.quality.features.comparison import FEATURES
 from benchmarks.quality.features.feature_figure import ROWS
-from benchmarks.speed import growth
+from benchmarks.speed.common import growth
 from benchmarks.speed.update import plots
-from docs.readme_tables import SPEED, load
+from docs.results import SPEED, load
 from training.nav import experiment
 from training.traversability import block
 

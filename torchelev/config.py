@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from torchelev.channels.config import ChannelConfigs, parse_channels
 from torchelev.errors import require
-from torchelev.files.config_files import from_json, read_settings, without_header, write_settings
+from torchelev.files.config_files import from_json, read_settings, split_off_completion, without_header, write_settings
 from torchelev.grid import GridConfig
 from torchelev.layers import LAYERS
 from torchelev.levels.config import LevelsConfig
@@ -126,8 +126,9 @@ class ElevationMapConfig:
             values = without_header(values)
         if not isinstance(values, dict):
             return _build(cls, values, "config")
-        other = ("filters", "channels", *(("completion",) if values.get("completion") is None else ()))  # of old files
-        stages = {name: value for name, value in values.items() if name not in other}
+        others, completes = split_off_completion(values)
+        values = values if completes else others  # a completion is refused as what is no setting
+        stages = {name: value for name, value in values.items() if name not in ("filters", "channels")}
         own: dict[str, Any] = {"channels": values["channels"]} if values.get("channels") is not None else {}
         if "filters" in values:
             from torchelev.filters.chain import filters_from_list  # a map without filters needs none of them

@@ -137,7 +137,7 @@ class ElevationMap(RestartableMap):
                 instant. Required: ageing and visibility clean-up depend on it.
             variance: variance of each point's height [m^2], (B, N) or (B, S, N), in place of the noise model. Points
                 whose variance is not positive and finite are ignored.
-            T_base_links: poses of the links in the base frame, (B, K, 4, 4), as joint encoders tell them at the time of
+            T_base_links: poses of the links in the base frame, (B, K, 4, 4), as joint encoders gave them at the time of
                 the points, in the order of `cfg.sensor.body.links`. Required if the body is a `RobotBody`, and only
                 then.
             pose_covariance: covariance of each sensor's pose, (B, 6, 6) or (B, S, 6, 6): x, y, z [m], then the
@@ -378,7 +378,7 @@ class ElevationMap(RestartableMap):
             options: of `torchelev.viz.live.LiveView`, such as `port`.
 
         Returns:
-            The view: its `show` shows the map anew after further updates, `close` ends it.
+            The view: its `show` shows the map again after further updates, `close` ends it.
         """
         from torchelev.viz.live import open_view
 

@@ -23,7 +23,7 @@ from benchmarks import RESULTS
 from benchmarks.gpu.agreement import correctness, host_never_waits
 from benchmarks.gpu.report import verdicts
 from benchmarks.gpu.timing import Figure, many_robots, one_robot
-from benchmarks.speed.workload import Drive, full_config
+from benchmarks.speed.common.workload import Drive, full_config
 from torchelev.app.results import markdown_table, slug, write_json
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.speed.workload import Drive, full_config
+from benchmarks.speed.common.workload import Drive, full_config
 from torchelev import ElevationMap
 
 

@@ -10,8 +10,8 @@ import torch
 from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 
-from benchmarks.speed import meter
-from benchmarks.speed.workload import BPEARL, Drive, full_config
+from benchmarks.speed.common import meter
+from benchmarks.speed.common.workload import BPEARL, Drive, full_config
 
 _SCAN_POINTS = 187  # of a height scan
 Figure = tuple[str, Callable[[], Any]]  # its name and the call that measures it

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from benchmarks import RESULTS
 from benchmarks.quality.em_cupy_channels import channels_table, evaluate_channels
-from benchmarks.speed.workload import BPEARL, Drive, full_config
+from benchmarks.speed.common.workload import BPEARL, Drive, full_config
 from torchelev import ElevationMap, ElevationMapConfig
 from torchelev.app.results import markdown_table, write_json
 from torchelev.stages.like_em_cupy import DEFAULTS

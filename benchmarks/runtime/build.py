@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.speed.workload import BPEARL, Drive, full_config
+from benchmarks.speed.common.workload import BPEARL, Drive, full_config
 from torchelev.kernels.registry import PACKAGE
 from torchelev.runtime.stream import write_instant
 

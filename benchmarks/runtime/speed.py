@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.runtime.build import build, machine, write_config, write_stream
+from benchmarks.speed.common.workload import BPEARL
 from benchmarks.speed.loop import busy_process
-from benchmarks.speed.workload import BPEARL
 
 _PYTHON = """
 import sys, time, numpy as np, torch

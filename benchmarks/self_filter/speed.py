@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from benchmarks.self_filter.robot import Scan, make_body, make_cameras, walk
-from benchmarks.speed.meter import interleaved
+from benchmarks.speed.common.meter import interleaved
 from torchelev import BodyConfig, ElevationMap, ElevationMapConfig, GridConfig, RobotBody, SensorConfig
 
 ROBOTS = 256

@@ -23,8 +23,8 @@ import numpy as np
 import torch
 
 from benchmarks import RESULTS
-from benchmarks.speed.bag_drive import CLOUDS, MAP_FRAME, POSES, SENSOR_FRAME, write_bag
-from benchmarks.speed.meter import in_new_process, peak_megabytes, progress
+from benchmarks.speed.common.bag_drive import CLOUDS, MAP_FRAME, POSES, SENSOR_FRAME, write_bag
+from benchmarks.speed.common.meter import in_new_process, peak_megabytes, progress
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig
 from torchelev.app.results import markdown_table, write_json
 from torchelev.io import MappingRun

@@ -2,7 +2,7 @@
 
     python -m benchmarks.speed.channels
 
-All stages are on, and the robots drive, as in `benchmarks.speed.workload`. Three channels may take 1.25 times the time
+All stages are on, and the robots drive, as in `common.workload`. Three channels may take 1.25 times the time
 of none, and an image of 640 x 480 pixels 3 ms on a map of 250 x 250 cells, on two threads. Writes
 benchmarks/results/channels.json.
 """
@@ -17,8 +17,8 @@ import click
 import torch
 
 from benchmarks import RESULTS
-from benchmarks.speed.meter import interleaved
-from benchmarks.speed.workload import BPEARL, MANY_POINTS, Drive, full_config
+from benchmarks.speed.common.meter import interleaved
+from benchmarks.speed.common.workload import BPEARL, MANY_POINTS, Drive, full_config
 from torchelev import ChannelConfig
 from torchelev.app.results import machine, markdown_table, write_json
 from torchelev.frames import change_axes

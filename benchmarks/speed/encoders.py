@@ -18,7 +18,7 @@ from rsl_rl.models import CNNModel, MLPModel
 from tensordict import TensorDict
 
 from benchmarks import RESULTS
-from benchmarks.speed.meter import interleaved
+from benchmarks.speed.common.meter import interleaved
 from torchelev.app.results import markdown_table, write_json
 from torchelev.encoders.rsl_rl import AttentionModel
 

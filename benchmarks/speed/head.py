@@ -16,8 +16,8 @@ import click
 import torch
 
 from benchmarks import RESULTS
-from benchmarks.speed.meter import interleaved
-from benchmarks.speed.workload import BPEARL, Drive, full_config
+from benchmarks.speed.common.meter import interleaved
+from benchmarks.speed.common.workload import BPEARL, Drive, full_config
 from torchelev import ElevationMap, LearnedTraversabilityConfig, RobotConfig, TraversabilityNet
 from torchelev.app.results import markdown_table, write_json
 

@@ -2,7 +2,7 @@
 
     python -m benchmarks.speed.levels
 
-All stages are on. Robots drive over rough ground as in `benchmarks.speed.workload`, or walk below a table, where a cell
+All stages are on. Robots drive over rough ground as in `common.workload`, or walk below a table, where a cell
 holds several surfaces. Three levels may take 1.6 times the time of one and 2.5 times the memory, and a voxel crop of
 32 x 32 x 40 for 256 robots 5 ms, or 60 ms of distances, on two threads. Writes benchmarks/results/levels_speed.json.
 """
@@ -18,8 +18,8 @@ import click
 import torch
 
 from benchmarks import RESULTS
-from benchmarks.speed.meter import interleaved
-from benchmarks.speed.workload import BPEARL, MANY_POINTS, Drive, full_config
+from benchmarks.speed.common.meter import interleaved
+from benchmarks.speed.common.workload import BPEARL, MANY_POINTS, Drive, full_config
 from torchelev import ElevationMap, LevelsConfig
 from torchelev.app.results import machine, markdown_table, write_json
 from torchelev.observations import VoxelCrop

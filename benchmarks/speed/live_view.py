@@ -21,7 +21,7 @@ import click
 import torch
 
 from benchmarks import RESULTS
-from benchmarks.speed.meter import progress
+from benchmarks.speed.common.meter import progress
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig
 from torchelev.app.results import markdown_table, write_json
 from torchelev.sim.poses import pose

@@ -31,8 +31,8 @@ from torch._dynamo.utils import counters
 from tqdm import tqdm
 
 from benchmarks import RESULTS
-from benchmarks.speed.growth import plot, table, verdicts
-from benchmarks.speed.workload import BPEARL, MANY_POINTS, Drive, full_config
+from benchmarks.speed.common.growth import plot, table, verdicts
+from benchmarks.speed.common.workload import BPEARL, MANY_POINTS, Drive, full_config
 from torchelev.app.results import commit, write_json
 
 CASES = {"one robot": (1, 250, BPEARL, 100_000), "256 robots": (256, 64, MANY_POINTS, 10_000)}

@@ -29,7 +29,7 @@ import click
 import torch
 
 from benchmarks import RESULTS
-from benchmarks.speed.workload import BPEARL, Drive, full_config
+from benchmarks.speed.common.workload import BPEARL, Drive, full_config
 from torchelev import HeightScan
 from torchelev.app.results import markdown_table, write_json
 from torchelev.ops.waiting import SETTINGS

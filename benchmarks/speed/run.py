@@ -20,10 +20,10 @@ from typing import Any
 import torch
 
 from benchmarks import RESULTS
-from benchmarks.speed import meter
+from benchmarks.speed.common import meter
+from benchmarks.speed.common.workload import full_config
 from benchmarks.speed.update import plots, tables
 from benchmarks.speed.update.sections import SECTIONS
-from benchmarks.speed.workload import full_config
 from torchelev.app.results import commit, machine, slug, write_json
 
 Sections = Mapping[str, Callable[[float], dict[str, Any]]]

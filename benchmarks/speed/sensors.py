@@ -20,8 +20,8 @@ import torch
 from torch import Tensor
 
 from benchmarks import RESULTS
-from benchmarks.speed import meter
-from benchmarks.speed.workload import by_tensors
+from benchmarks.speed.common import meter
+from benchmarks.speed.common.workload import by_tensors
 from torchelev.app.results import markdown_table, slug, write_json
 from torchelev.sim import DepthCamera, Lidar, mount
 from torchelev.sim.exact.sensors import NonRepetitiveLidar

@@ -21,15 +21,15 @@ import torch
 from torch import Tensor
 
 from benchmarks import RESULTS
-from benchmarks.speed.meter import interleaved
-from benchmarks.speed.workload import MANY_POINTS, Drive, full_config
+from benchmarks.speed.common.meter import interleaved
+from benchmarks.speed.common.workload import MANY_POINTS, Drive, full_config
 from envs.terrain_nav import TerrainNav
 from envs.terrain_nav.sight import MapSight
 from envs.terrain_nav.task import NUM_ACTIONS
 from torchelev import ElevationMap, HeightScan
 from torchelev.app.results import markdown_table, write_json
 from torchelev.observations.fill import FILLS, ORIGINAL
-from torchelev.observations.presets import PRESETS
+from torchelev.observations.scan.presets import PRESETS
 from torchelev.state import map_layers
 
 NUM_ENVS = 256

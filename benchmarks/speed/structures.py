@@ -15,9 +15,9 @@ import click
 import torch
 
 from benchmarks import RESULTS
-from benchmarks.speed import meter
+from benchmarks.speed.common import meter
+from benchmarks.speed.common.workload import by_tensors
 from benchmarks.speed.sensors import SENSORS, standing
-from benchmarks.speed.workload import by_tensors
 from torchelev.app.results import machine, markdown_table, write_json
 from torchelev.sim import CourseConfig, CoversConfig, MountedSensor, make_course
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from envs.quadruped.kinematics import JOINTS
+from torchelev.observations.patterns import compute_heading
 
 #: names of the entries of the observation "policy"
 ENTRIES = (
@@ -60,3 +61,11 @@ def rotation_matrix(quat_wxyz: Tensor) -> Tensor:
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def to_yaw_frame(vector: Tensor, T_map_base: Tensor) -> Tensor:
+    """Return vectors (B, 3) of the map frame in the yaw frame of the base."""
+    forward = compute_heading(T_map_base)
+    ahead = (vector[:, :2] * forward).sum(-1)
+    left = vector[:, 1] * forward[:, 0] - vector[:, 0] * forward[:, 1]
+    return torch.stack([ahead, left, vector[:, 2]], -1)

@@ -6,59 +6,33 @@ environment call them in the order of their interfaces. Physics runs on the CPU;
 
 from __future__ import annotations
 
-import math
-from typing import Any, NamedTuple
-
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from envs.batched_task import BatchedTask
 from envs.quadruped.config import PERCEPTION, QuadrupedConfig
+from envs.quadruped.episode.commands import draw_commands, yaw_rate
+from envs.quadruped.episode.outcome import ENDINGS, Outcome
+from envs.quadruped.episode.rewards import Motion, reward
+from envs.quadruped.episode.starts import draw_starts
 from envs.quadruped.gait import foot_positions, joint_targets
 from envs.quadruped.kinematics import feet_in_base, joint_angles, link_poses
 from envs.quadruped.odometry import LegOdometry
 from envs.quadruped.physics import Physics, Sensed
-from envs.quadruped.proprioception import observe_body, observe_privileged, rotation_matrix
-from envs.quadruped.rewards import Motion, reward
+from envs.quadruped.proprioception import observe_body, to_yaw_frame
+from envs.quadruped.robots import CONTACT, Robots
 from envs.quadruped.sight import SIGHTS, TruthSight, View
 from torchelev.errors import require, require_count
-from torchelev.frames.arrays import assemble
-from torchelev.observations.patterns import compute_heading
 from torchelev.sim import surface_of, terrain_grid
 
 NUM_ACTIONS = 12
-ENDINGS = ("crossed", "fallen", "timed_out")  # how an episode can end
-_CONTACT = 1.0  # [N] of a foot that stands
 
 
-class Outcome(NamedTuple):
-    """Result of a step for B robots."""
-
-    reward: Tensor  #: (B,)
-    crossed: Tensor  #: (B,) bool, whether the robot has reached the rim of its tile
-    fallen: Tensor  #: (B,) bool, whether the robot has fallen
-    timed_out: Tensor  #: (B,) bool, whether time has run out
-
-    @property
-    def terminated(self) -> Tensor:
-        """Whether the episode has ended by a fall (B,)."""
-        return self.fallen
-
-    @property
-    def truncated(self) -> Tensor:
-        """Whether the episode was cut, as the tile is crossed or time has run out (B,)."""
-        return self.crossed | self.timed_out
-
-    @property
-    def done(self) -> Tensor:
-        """Whether the episode has ended, in any way (B,)."""
-        return self.terminated | self.truncated
-
-
-class Quadruped(nn.Module):
+class Quadruped(BatchedTask):
     """B quadrupeds that walk across their tiles.
 
     The action (B, 12) moves the feet of a trot, leg by leg along x, y and z of the base; `gait.py` turns feet into
-    joint angles, which PD controllers hold. `rewards.py` gives the reward.
+    joint angles, which PD controllers hold. `episode.rewards` gives the reward.
 
     An episode terminates when the robot falls: its base touches the ground or tilts by more than `max_tilt`, or its
     simulation diverges. It is truncated when the robot has crossed its tile, or after `episode_length`.
@@ -76,7 +50,7 @@ class Quadruped(nn.Module):
         ValueError: `perception` is none of the three, or `num_envs` is not positive.
     """
 
-    num_actions = NUM_ACTIONS
+    num_actions, ending_names = NUM_ACTIONS, ENDINGS
     level: Tensor
     kind: Tensor
     phase: Tensor
@@ -88,7 +62,6 @@ class Quadruped(nn.Module):
     episode_length: Tensor
     since_sight: Tensor
     commanded: Tensor
-    endings: Tensor
     steps: Tensor
     noise: Tensor
 
@@ -113,6 +86,7 @@ class Quadruped(nn.Module):
             resolution=terrain.resolution, seed=terrain.seed, device=device,
         ).with_surface(**surface_of("mujoco"))  # fmt: skip
         self.physics = Physics(self.terrain, num_envs, self.cfg.random, seed)
+        self.robots = Robots(self.physics, device)
         self.generator = torch.Generator(device)
         self.odometry = LegOdometry(self.cfg.odometry, num_envs, device)
         self.sight = SIGHTS[perception](self.cfg, self.terrain.field, num_envs, compiled)
@@ -150,8 +124,7 @@ class Quadruped(nn.Module):
     @property
     def T_map_base(self) -> Tensor:
         """True poses of the robots (B, 4, 4) in the frame of their tile."""
-        position = self._qpos[:, :3] - torch.nn.functional.pad(self.origins[self.tile_ids], (0, 1))
-        return assemble(position, rotation_matrix(self._qpos[:, 3:7]))
+        return self.robots.pose_from(self.origins[self.tile_ids])
 
     @property
     def max_episode_length(self) -> int:
@@ -168,20 +141,6 @@ class Quadruped(nn.Module):
         """Figures that a training shows: endings, the mean level, and each term of the reward per second."""
         terms = {f"reward/{name}": value.mean() / self.cfg.dt for name, value in self.reward_terms.items()}
         return {**self.ending_fractions, "level": self.level.float().mean(), **terms}
-
-    @property
-    def ending_fractions(self) -> dict[str, Tensor]:
-        """Fraction of the last finished episodes that ended in each way; zeros before the first one has finished."""
-        finished = self.endings.sum().clamp(min=1.0)
-        return {name: ended.sum() / finished for name, ended in zip(ENDINGS, self.endings, strict=True)}
-
-    @property
-    def _qpos(self) -> Tensor:
-        return self._floats(self.physics.qpos)
-
-    def _floats(self, values: Tensor) -> Tensor:
-        """Return values of the physics as float32 on the device."""
-        return values.to(self.device, torch.float32)
 
     # Steps --------------------------------------------------------------------------------------------------------
 
@@ -215,7 +174,7 @@ class Quadruped(nn.Module):
     @property
     def forward_speed(self) -> Tensor:
         """Speed of the robots ahead (B,) [m/s]."""
-        return _to_yaw_frame(self._floats(self.physics.qvel[:, :3]), self.T_map_base)[:, 0]
+        return to_yaw_frame(self.robots.qvel[:, :3], self.T_map_base)[:, 0]
 
     def _choose_levels(self, mask: Tensor) -> None:
         """Move robots up that crossed their tile, and down that walked less than half the commanded distance.
@@ -230,7 +189,7 @@ class Quadruped(nn.Module):
             self._is_fresh = False
         else:
             distance = torch.linalg.vector_norm(self.T_map_base[:, :2, 3], dim=-1)
-            crossed = self._has_crossed() & ~self._has_fallen(self._sensed())
+            crossed = self._has_crossed() & ~self.robots.have_fallen(self.robots.sensed(), self.cfg.max_tilt)
             failed = distance < 0.5 * self.commanded
             self._store("level", self.terrain.promote(self.level, crossed, failed, self.generator), mask)
 
@@ -239,20 +198,10 @@ class Quadruped(nn.Module):
         env_ids = mask.cpu().nonzero()[:, 0].tolist()
         if not env_ids:
             return
-        n, cfg = len(env_ids), self.cfg
-        u = self._uniform(5, self.num_envs)[:, env_ids].cpu()
-        phase = torch.where(u[0] < 0.5, 0.0, 0.5)
-        self.phase[env_ids] = phase.to(self.device)
-        yaw, offset = (2 * u[1] - 1) * math.pi, 0.6 * (u[2:4] - 0.5)
-        qpos = torch.zeros(n, 19, dtype=torch.float64)
-        qpos[:, :2] = self.physics.tile_origins[self.tile_ids[env_ids].cpu()] + offset.t()
-        qpos[:, 2] = cfg.gait.body_height + 0.02
-        qpos[:, 3], qpos[:, 6] = torch.cos(yaw / 2), torch.sin(yaw / 2)
-        still = torch.zeros(n, 3)
-        qpos[:, 7:] = joint_angles(foot_positions(phase, still, cfg.gait))
-        bodies = (u[4] * cfg.random.num_bodies).long().clamp(max=cfg.random.num_bodies - 1)
-        self.physics.place(env_ids, qpos, torch.zeros(n, 18, dtype=torch.float64), bodies)
-        self.heading[env_ids] = yaw.to(self.device)
+        origins = self.physics.tile_origins[self.tile_ids[env_ids].cpu()]
+        phase, yaw, qpos, bodies = draw_starts(self._uniform(5, self.num_envs)[:, env_ids].cpu(), origins, self.cfg)
+        self.physics.place(env_ids, qpos, torch.zeros(len(env_ids), 18, dtype=torch.float64), bodies)
+        self.phase[env_ids], self.heading[env_ids] = phase.to(self.device), yaw.to(self.device)
 
     def advance(self, action: Tensor) -> Outcome:
         """Move the robots by one step of `cfg.dt`.
@@ -268,37 +217,31 @@ class Quadruped(nn.Module):
         require(actual == expected, "action", f"expected {expected}", actual, hint)
         cfg, limit = self.cfg, self.cfg.gait.max_action
         action = action.to(self.device, torch.float32).nan_to_num(0.0).clamp(-limit, limit)
-        self._steer()
+        self.command[:, 2] = yaw_rate(self.command, self.heading, self.T_map_base, cfg.command)
         self._store("phase", (self.phase + cfg.gait.frequency * cfg.dt).remainder(1.0))
         targets = joint_targets(action, self.phase, self.command, cfg.gait)
         self.physics.step(targets.cpu().double(), self.latency.cpu(), cfg.substeps)
-        sensed = self._sensed()
+        sensed = self.robots.sensed()
         self._store("episode_length", self.episode_length + 1)
         self._store("commanded", self.commanded + torch.linalg.vector_norm(self.command[:, :2], dim=-1) * cfg.dt)
         self._store("since_sight", self.since_sight + cfg.dt)
-        velocity = self._floats(self.physics.sensed_qvel[:, :3])  # of the sensors' instant
-        self.odometry.step(velocity, sensed.sole_velocities, sensed.foot_forces, cfg.dt)
+        self.odometry.step(self.robots.sensed_velocity, sensed.sole_velocities, sensed.foot_forces, cfg.dt)
         outcome = self._evaluate(action, sensed)
-        self._store("joint_velocities", self._floats(self.physics.qvel[:, 6:]))
+        self._store("joint_velocities", self.robots.qvel[:, 6:])
         self._store("action", action)
-        endings = torch.stack([getattr(outcome, name) for name in ENDINGS])
-        self._store("endings", torch.where(outcome.done, endings.to(self.endings.dtype), self.endings))
+        self._note_endings(outcome)
         self._push()
         self._draw_commands(self._happens(cfg.command.interval))
         self._draw_noise()
         return outcome
 
-    def _sensed(self) -> Sensed:
-        """Return what the sensors measured, as float32 on the device."""
-        return Sensed(*(self._floats(value) for value in self.physics.sensed()))
-
     def _evaluate(self, action: Tensor, sensed: Sensed) -> Outcome:
         """Return reward and endings of a step. No term combines sensors with the state, which is 5 ms later."""
         cfg, T_map_base = self.cfg, self.T_map_base
-        qvel = self._floats(self.physics.qvel)
-        fallen = self._has_fallen(sensed)
+        qvel = self.robots.qvel
+        fallen = self.robots.have_fallen(sensed, cfg.max_tilt)
         motion = Motion(
-            velocity=_to_yaw_frame(qvel[:, :3], T_map_base),
+            velocity=to_yaw_frame(qvel[:, :3], T_map_base),
             angular_velocity=qvel[:, 3:6],
             gravity=-T_map_base[:, 2, :3],
             command=self.command,
@@ -308,7 +251,7 @@ class Quadruped(nn.Module):
             last_action=self.action,
             touches=(sensed.touches > 0).float(),
             foot_speed=torch.linalg.vector_norm(sensed.sole_velocities[..., :2], dim=-1),
-            stands=sensed.foot_forces > _CONTACT,
+            stands=sensed.foot_forces > CONTACT,
             fallen=fallen,
         )
         value, self.reward_terms = reward(motion, cfg.reward, cfg.dt)
@@ -316,34 +259,16 @@ class Quadruped(nn.Module):
         timed_out = (self.episode_length >= cfg.max_episode_length) & ~fallen & ~crossed
         return Outcome(value.nan_to_num(0.0).clamp(-10.0, 10.0), crossed, fallen, timed_out)
 
-    def _has_fallen(self, sensed: Sensed) -> Tensor:
-        """Return which robots lie on their base, tilt too far or have diverged (B,)."""
-        upright = rotation_matrix(self._qpos[:, 3:7])[:, 2, 2]
-        tilts = upright < math.cos(self.cfg.max_tilt)
-        return (sensed.touches[:, 0] > 0) | tilts | self.physics.diverged.to(self.device)
-
     def _has_crossed(self) -> Tensor:
         """Return which robots are at the rim of their tile (B,)."""
         terrain = self.cfg.terrain
         return self.T_map_base[:, :2, 3].abs().amax(-1) > terrain.length / 2 - terrain.rim
 
-    def _steer(self) -> None:
-        """Set the commanded yaw rate from the error of the heading (legged_gym)."""
-        cfg, forward = self.cfg.command, compute_heading(self.T_map_base)
-        error = self.heading - torch.atan2(forward[:, 1], forward[:, 0])
-        error = torch.remainder(error + math.pi, 2 * math.pi) - math.pi
-        rate = (cfg.heading_gain * error).clamp(-cfg.max_yaw_rate, cfg.max_yaw_rate)
-        stands = (self.command[:, :2].abs().amax(-1) == 0).float()
-        self.command[:, 2] = rate * (1 - stands)
-
     def _draw_commands(self, mask: Tensor) -> None:
         """Draw new commands in the environments of `mask` (B,) bool."""
-        cfg, u = self.cfg.command, self._uniform(4, self.num_envs)
-        moves = (u[3] >= cfg.standing).float()
-        ahead, left = (low + (high - low) * x for (low, high), x in ((cfg.forward, u[0]), (cfg.left, u[1])))
-        command = torch.stack([ahead * moves, left * moves, torch.zeros_like(ahead)], -1)
+        command, heading = draw_commands(self._uniform(4, self.num_envs), self.heading, self.cfg.command)
         self._store("command", command, mask)
-        self._store("heading", self.heading + cfg.heading * (2 * u[2] - 1), mask)
+        self._store("heading", heading, mask)
 
     def _push(self) -> None:
         """Change the velocity of some robots at random."""
@@ -370,7 +295,7 @@ class Quadruped(nn.Module):
         return View(
             T_map_base=T_map_base,
             T_estimated=self.odometry.estimate(T_map_base),
-            T_base_links=link_poses(self._qpos[:, 7:]),
+            T_base_links=link_poses(self.robots.qpos[:, 7:]),
             T_base_links_measured=link_poses(joints),
             feet=feet_in_base(joints),
             tile_ids=self.tile_ids,
@@ -378,7 +303,7 @@ class Quadruped(nn.Module):
 
     def _joints(self) -> Tensor:
         """Return what the joint encoders read (B, 12) [rad]."""
-        return self._qpos[:, 7:] + self.cfg.random.joint_noise * self.noise[:, 18:]
+        return self.robots.qpos[:, 7:] + self.cfg.random.joint_noise * self.noise[:, 18:]
 
     def observe(self, critic: bool = True) -> dict[str, Tensor]:
         """Return new tensors with the current observations.
@@ -390,10 +315,10 @@ class Quadruped(nn.Module):
             "policy" (B, 50), see `observe_body`. "height_scan" (B, 187) and "feet" (B, 56) as `perception` says. For
             the critic "privileged" (B, 20), "true_height_scan" and "true_feet", the scans of the true ground.
         """
-        cfg, rotation = self.cfg, rotation_matrix(self._qpos[:, 3:7])
+        cfg, rotation = self.cfg, self.robots.rotation
         random, noise, view = cfg.random, self.noise, self.view()
         standing = joint_angles(foot_positions(torch.zeros_like(self.phase), torch.zeros_like(self.command), cfg.gait))
-        qvel = self._floats(self.physics.qvel)
+        qvel = self.robots.qvel
         policy = observe_body(
             (rotation.mT @ self.odometry.velocity[..., None])[..., 0],
             qvel[:, 3:6] + random.gyro_noise * noise[:, :3],
@@ -406,12 +331,7 @@ class Quadruped(nn.Module):
         )
         seen = {"policy": policy, **self.sight.read(view)}
         if critic:
-            sensed = self._sensed()
-            velocity = (rotation.mT @ qvel[:, :3, None])[..., 0]
-            stands = sensed.foot_forces > _CONTACT
-            sensed_rotation = rotation_matrix(self._floats(self.physics.sensed_qpos[:, 3:7]))
-            feet = sensed.foot_velocities @ sensed_rotation  # rows: v^T R = (R^T v)^T
-            seen["privileged"] = observe_privileged(velocity, stands, feet, self.latency)
+            seen["privileged"] = self.robots.observe_privileged(self.latency)
             seen |= {f"true_{name}": value for name, value in self.truth.read(view).items()}
         return seen
 
@@ -424,32 +344,7 @@ class Quadruped(nn.Module):
         """Draw numbers from 0 to 1, by default one for each robot."""
         return torch.rand(shape or (self.num_envs,), generator=self.generator, device=self.device)
 
-    def _store(self, name: str, value: Tensor, mask: Tensor | None = None) -> None:
-        """Write into a buffer in place, as CONTRIBUTING.md explains under inference mode."""
-        buffer = getattr(self, name)
-        if mask is not None:
-            value = torch.where(mask.view(-1, *[1] * (buffer.ndim - 1)), value, buffer)
-        buffer.copy_(value)
-
     def seed(self, seed: int) -> None:
-        """Seed all random number generators, so that the next `reset` begins the same episodes."""
-        generators = (getattr(module, "generator", None) for module in self.modules())
-        for index, generator in enumerate(g for g in generators if isinstance(g, torch.Generator)):
-            generator.manual_seed(1000 * seed + index)  # all different, also from those of the next seeds
+        """Seed all random number generators; the next `reset` draws levels as at the start, without the curriculum."""
+        super().seed(seed)
         self._is_fresh = True
-
-    def get_extra_state(self) -> dict[str, Any]:
-        """Return the states of the random number generators, so that a resumed training continues exactly."""
-        return {"generator": self.generator.get_state()}
-
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Set the states of the random number generators."""
-        self.generator.set_state(state["generator"].cpu())
-
-
-def _to_yaw_frame(vector: Tensor, T_map_base: Tensor) -> Tensor:
-    """Return vectors (B, 3) of the map frame in the yaw frame of the base."""
-    forward = compute_heading(T_map_base)
-    ahead = (vector[:, :2] * forward).sum(-1)
-    left = vector[:, 1] * forward[:, 0] - vector[:, 0] * forward[:, 1]
-    return torch.stack([ahead, left, vector[:, 2]], -1)

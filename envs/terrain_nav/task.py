@@ -6,11 +6,10 @@ in the order of their interfaces. All state is tensors on one device.
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from envs.batched_task import BatchedTask
 from envs.terrain_nav.config import PERCEPTION, TerrainNavConfig
 from envs.terrain_nav.course import make_rated_course
 from envs.terrain_nav.outcome import ENDINGS, Outcome
@@ -22,7 +21,7 @@ from torchelev.errors import require, require_count
 NUM_ACTIONS = 2  # forward speed and yaw rate
 
 
-class TerrainNav(nn.Module):
+class TerrainNav(BatchedTask):
     """B robots that walk to their goals.
 
     With the distance d to the goal [m], the action a, and [x] = 1 if x holds and 0 otherwise, the reward of a step is
@@ -45,7 +44,7 @@ class TerrainNav(nn.Module):
         ValueError: `perception` is none of the three, `num_envs` is not positive, or the truth should show voxels.
     """
 
-    num_actions = NUM_ACTIONS
+    num_actions, ending_names = NUM_ACTIONS, ENDINGS
     max_action = 1.0
     xy: Tensor
     yaw: Tensor
@@ -58,7 +57,6 @@ class TerrainNav(nn.Module):
     episode_length: Tensor
     blocked_time: Tensor
     last_action: Tensor
-    endings: Tensor
 
     def __init__(
         self,
@@ -120,12 +118,6 @@ class TerrainNav(nn.Module):
         return self.ending_fractions
 
     @property
-    def ending_fractions(self) -> dict[str, Tensor]:
-        """Fraction of the last finished episodes that ended in each way; zeros before the first one has finished."""
-        finished = self.endings.sum().clamp(min=1.0)
-        return {name: ended.sum() / finished for name, ended in zip(ENDINGS, self.endings, strict=True)}
-
-    @property
     def distance(self) -> Tensor:
         """Distance of each robot to its goal (B,) [m]."""
         return torch.linalg.vector_norm(self.goal - self.xy, dim=-1)
@@ -170,8 +162,7 @@ class TerrainNav(nn.Module):
         self.episode_length.add_(1)
         outcome = self._evaluate(old_distance, action)
         self._store("last_action", action)
-        endings = torch.stack([getattr(outcome, name) for name in ENDINGS])
-        self._store("endings", torch.where(outcome.done, endings.to(self.endings.dtype), self.endings))
+        self._note_endings(outcome)
         return outcome
 
     def _evaluate(self, old_distance: Tensor, action: Tensor) -> Outcome:
@@ -206,28 +197,3 @@ class TerrainNav(nn.Module):
         policy = observe_body(T_map_base, self.goal, self.velocity, self.last_action, self.blocked_time)
         seen = {"policy": policy, "map": self.sight.image(T_map_base, self.tile_ids)}
         return seen | ({"truth": self.truth.image(T_map_base, self.tile_ids)} if critic else {})
-
-    def _store(self, name: str, value: Tensor, mask: Tensor | None = None) -> None:
-        """Write into a buffer in place, as CONTRIBUTING.md explains under inference mode."""
-        buffer = getattr(self, name)
-        if mask is not None:
-            value = torch.where(mask.view(-1, *[1] * (buffer.ndim - 1)), value, buffer)
-        buffer.copy_(value)
-
-    def _generators(self) -> list[torch.Generator]:
-        """Return the random number generators of the task, its sights and their errors."""
-        generators = (getattr(module, "generator", None) for module in self.modules())
-        return [generator for generator in generators if isinstance(generator, torch.Generator)]
-
-    def seed(self, seed: int) -> None:
-        """Seed all random number generators, so that the next `reset` begins the same episodes."""
-        for index, generator in enumerate(self._generators()):
-            generator.manual_seed(1000 * seed + index)  # all different, also from those of the next seeds
-
-    def get_extra_state(self) -> dict[str, Any]:
-        """Return the state of the random number generator, so that a resumed training continues exactly."""
-        return {"generator": self.generator.get_state()}
-
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Set the state of the random number generator."""
-        self.generator.set_state(state["generator"].cpu())

@@ -9,7 +9,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 
 from tests.helpers import pose
 from torchelev import ChannelConfig, ElevationMap, ElevationMapConfig, GridConfig, HeightScan, MapImage
-from torchelev.observations.presets import PRESETS
+from torchelev.observations.scan.presets import PRESETS
 
 CHANNELS = {
     "rgb": "color",

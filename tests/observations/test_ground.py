@@ -6,7 +6,7 @@ import torch
 from tests.helpers import pose
 from tests.observations.maps import BASE, at, ground_map, near
 from torchelev.observations.height_scan import HeightScan
-from torchelev.observations.presets import PRESETS
+from torchelev.observations.scan.presets import PRESETS
 
 
 @pytest.mark.parametrize("scan", [*(HeightScan.preset(name) for name in PRESETS), HeightScan.grid()])

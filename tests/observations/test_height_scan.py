@@ -21,7 +21,7 @@ from torchelev.observations.height_scan import HeightScan
 from torchelev.observations.map_image import CHANNELS as ALL
 from torchelev.observations.map_image import MapImage
 from torchelev.observations.patterns import ALIGNMENTS
-from torchelev.observations.presets import PRESETS
+from torchelev.observations.scan.presets import PRESETS
 
 # The presets, worked out by hand: the base at (0.3, -0.2, 0.7) looks along +y, so that the pattern's point (x, y) lies
 # at (0.3 - y, -0.2 + x). Ground 0.1 x + 0.2 y:

@@ -10,7 +10,7 @@ import torch
 import torchelev as te
 from tests.helpers import pose, random_clouds
 from torchelev import HeightScan
-from torchelev.observations.presets import PRESETS
+from torchelev.observations.scan.presets import PRESETS
 from torchelev.observations.scan_layout import scan_layout
 from torchelev.runtime.library import CMap, LibraryError
 

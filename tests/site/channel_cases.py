@@ -5,10 +5,10 @@ import torch
 
 from tests.helpers import pose, small_map
 from torchelev import ChannelConfig
-from torchelev.site.channels import SiteChannels
+from torchelev.site.content.channels import SiteChannels
+from torchelev.site.content.tiles import LAYERS
 from torchelev.site.storage.engines import open_store
 from torchelev.site.storage.store import TileStore
-from torchelev.site.tiles import LAYERS
 
 CELL = [0.05, 0.05]
 NAMES, GRASS, STONE = ("grass", "stone"), (1.0, 0.0), (0.0, 1.0)

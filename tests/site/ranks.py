@@ -15,7 +15,7 @@ import torch.distributed as dist
 from tests.helpers import small_map
 from tests.site.helpers import fill, live
 from torchelev.site import LostRankError, SiteConfig, SiteMap
-from torchelev.site.reading import LAYERS
+from torchelev.site.content.reading import LAYERS
 from torchelev.site.storage.versioned import store
 from torchelev.site.storage.versioned.repository import RefusedCommitError
 

@@ -8,10 +8,10 @@ import torch.distributed as dist
 from tests.site import ranks
 from tests.site.ranks import run_ranks
 from torchelev.site import SiteMap
+from torchelev.site.content.tiles import CELLS
 from torchelev.site.shared.messages import make_messages, read_message
 from torchelev.site.shared.owners import number_along_curve, share_out
 from torchelev.site.shared.parts import cut_cells
-from torchelev.site.tiles import CELLS
 
 SHARES = {
     2: [[0], list(range(1, 11))],

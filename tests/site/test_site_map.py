@@ -13,7 +13,7 @@ from tests.helpers import nans, off_borders, pose, seen_from, small_map
 from tests.site.helpers import fill, ground, known_cells, limits, live, robots
 from torchelev import ElevationMap
 from torchelev.site import SiteConfig, SiteMap
-from torchelev.site.tiles import Tiles
+from torchelev.site.content.tiles import Tiles
 
 
 def dense_means(emap):

@@ -15,7 +15,8 @@ from torchelev.traversability.features import complete, extremes, features
 from torchelev.traversability.net import TraversabilityNet
 from torchelev.traversability.rate import rate
 from torchelev.traversability.stances import Way, in_cells, stances
-from torchelev.traversability.weight_file import RANGES, VERSION, conditions, ratios
+from torchelev.traversability.trained_range import RANGES, conditions, ratios
+from torchelev.traversability.weight_file import VERSION
 
 ROBOT = RobotConfig()
 SMALL = dataclasses.replace(ROBOT, length=0.5, width=0.25, foot_radius=0.02, foot_reach=0.06, step_height=0.15)

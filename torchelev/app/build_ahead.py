@@ -11,10 +11,10 @@ from torchelev.kernels.cpu_build import AHEAD, build_ahead
 from torchelev.kernels.cpu_update import compiled_stages
 from torchelev.kernels.registry import PACKAGE
 from torchelev.observations.image_kernel import LIBRARY as IMAGES
-from torchelev.observations.scan_kernel import LIBRARY as SCANS
+from torchelev.observations.scan.kernel import LIBRARY as SCANS
 from torchelev.observations.voxel_kernel import LIBRARY as VOXELS
 from torchelev.pipeline import register_stages
-from torchelev.planning.dijkstra import LIBRARY as DIJKSTRA
+from torchelev.planning.solvers.dijkstra import LIBRARY as DIJKSTRA
 from torchelev.robot_body.own_kernel import LIBRARY as OWN_POINTS
 from torchelev.runtime.library import library_parts
 from torchelev.sim.errors.cloud_kernel import LIBRARY as ERRORS

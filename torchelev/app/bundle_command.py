@@ -1,4 +1,4 @@
-"""`torchelev export` and `torchelev check`: what leaves training for a robot."""
+"""`torchelev export` and `torchelev check`: the bundle that brings a trained policy to a robot."""
 
 from __future__ import annotations
 

@@ -51,6 +51,11 @@ def without_header(values: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if name not in (VERSION_NAME, SCHEMA_NAME)}
 
 
+def split_off_completion(values: dict[str, Any]) -> tuple[dict[str, Any], bool]:
+    """Return settings without `completion`, a stage of older versions, and whether it was switched on."""
+    return {name: value for name, value in values.items() if name != "completion"}, values.get("completion") is not None
+
+
 def from_json(value: Any) -> Any:
     """Return the number that `to_json` wrote as a text; anything else as it is."""
     return float(value) if value in ("inf", "-inf") else value

@@ -61,7 +61,7 @@ class GenesisMaps:
         self.emap.update(cloud.points, cloud.T_map_sensor, self.T_map_base, dt)
 
     def reset(self, env_ids: Int[Tensor, "K"] | None = None, *, mask: Bool[Tensor, "B"] | None = None) -> None:
-        """Forget the maps of environments that begin anew, by number or by mask; without both, of all."""
+        """Forget the maps of environments that restart, by number or by mask; without both, of all."""
         self.emap.reset(env_ids, mask=mask)
 
 

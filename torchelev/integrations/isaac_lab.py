@@ -76,7 +76,7 @@ class MapObservation(MapTerm, ManagerTermBase):
         self._sim = env.sim
 
     def reset(self, env_ids: Any = None) -> None:
-        """Forget the maps of environments that begin anew, whose robots stand at their new places already."""
+        """Forget the maps of environments that restart, whose robots stand at their new places already."""
         super().reset(env_ids)
         # Within a step nothing else moves their links before sensors measure: a camera would see the old place.
         self._sim.forward()

@@ -50,7 +50,7 @@ class MapTerm:
         return self.maps.emap
 
     def reset(self, env_ids: Any = None) -> None:
-        """Forget the maps of environments that begin anew; the manager calls it."""
+        """Forget the maps of environments that restart; the manager calls it."""
         self.maps.reset(env_ids)
 
     @torch.no_grad()

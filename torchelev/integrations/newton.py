@@ -144,7 +144,7 @@ class NewtonMaps:
             self.emap.update(cloud.points, cloud.T_map_sensor, self.T_map_base, dt)
 
     def reset(self, worlds: Int[Tensor, "K"] | None = None, *, mask: Bool[Tensor, "B"] | None = None) -> None:
-        """Forget the maps of worlds that begin anew, by number or by mask; without both, of all."""
+        """Forget the maps of worlds that restart, by number or by mask; without both, of all."""
         self.emap.reset(worlds, mask=mask)
 
     def _read_cloud(self, reader: _Reader, state: newton.State) -> Cloud:

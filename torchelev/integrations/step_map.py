@@ -43,7 +43,7 @@ class StepMap:
     """The maps of an environment's B robots.
 
     An update takes place in the first observation of every `update_every`-th control step, counted by the environment's
-    `common_step_counter`; later observations of the step read the same maps. An environment that begins anew within a
+    `common_step_counter`; later observations of the step read the same maps. An environment that restarts within a
     step that is already fused is fused alone, and the other maps stay as they are. One that begins between two updates
     reads an empty map until the next.
 
@@ -66,7 +66,7 @@ class StepMap:
 
     @torch.no_grad()
     def reset(self, env_ids: Any = None) -> None:
-        """Forget the maps of environments that begin anew: ids, a mask (B,) bool, a slice, or None for all."""
+        """Forget the maps of environments that restart: ids, a mask (B,) bool, a slice, or None for all."""
         self._has_begun = True
         if env_ids is None or isinstance(env_ids, slice):
             mask = torch.zeros_like(self._began)

@@ -14,9 +14,9 @@ from torchelev.lazy_names import import_later
 
 if TYPE_CHECKING:
     from torchelev.io.bags import GridMapWriter, is_bag, read_grid_map, read_grid_maps, write_grid_map
-    from torchelev.io.clouds import read_cloud
-    from torchelev.io.depth import read_depth
     from torchelev.io.errors import RecordingError
+    from torchelev.io.files.clouds import read_cloud
+    from torchelev.io.files.depth import read_depth
     from torchelev.io.files.intrinsics import Intrinsics, read_intrinsics
     from torchelev.io.files.layout import FileLayout
     from torchelev.io.folders.recording import Frame, Recording, open_recording
@@ -66,8 +66,8 @@ _LATER = {
     "link_poses": "torchelev.io.robot_model",
     "open_recording": "torchelev.io.folders.recording",
     "read_body": "torchelev.io.robot_model",
-    "read_cloud": "torchelev.io.clouds",
-    "read_depth": "torchelev.io.depth",
+    "read_cloud": "torchelev.io.files.clouds",
+    "read_depth": "torchelev.io.files.depth",
     "read_grid_map": "torchelev.io.bags",
     "read_grid_maps": "torchelev.io.bags",
     "read_intrinsics": "torchelev.io.files.intrinsics",

@@ -1,4 +1,4 @@
-"""Images of class labels, one number per pixel, and what they say to a channel of classes."""
+"""Images of class labels, one number per pixel, and the probabilities that they give to a channel of classes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 class LabelImage(NamedTuple):
     """Labels as a camera saw them."""
 
-    labels: NDArray[np.integer]  #: (h, w) number of the class; others than 0 to C - 1 say nothing
+    labels: NDArray[np.integer]  #: (h, w) number of the class; values other than 0 to C - 1 are ignored
     K: NDArray[np.float64]  #: (3, 3) [pixels] of an image of this size
     T_map_camera: NDArray[np.float64]  #: (4, 4), optical axes
     distortion: tuple[float, ...] = ()  #: as `ElevationMap.paint` has them; (): none

@@ -16,6 +16,7 @@ from torch import Tensor
 from torchelev.config import ElevationMapConfig
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
+from torchelev.files.config_files import split_off_completion
 from torchelev.files.output_files import atomic_file
 from torchelev.inputs import checks
 from torchelev.maps.buffers import name_tensors, state_of
@@ -83,10 +84,10 @@ def load_map(
     header = _header(path, arrays)
     ids = _ids(env_ids, _num_envs(path, arrays))
     try:
-        predicts = header["config"].pop("completion", None) is not None  # a stage of older versions
+        settings, completes = split_off_completion(header["config"])
         sizes = header.get("head")
         head = None if sizes is None else TraversabilityNet(**sizes).requires_grad_(False)
-        emap = ElevationMap(ElevationMapConfig.from_dict(header["config"]), len(ids), device, head=head)
+        emap = ElevationMap(ElevationMapConfig.from_dict(settings), len(ids), device, head=head)
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise ValueError(f"{path}: {error}; a filter of your own must be registered before it is loaded") from error
     emap = emap.to(_DTYPES[header["dtype"]])
@@ -95,7 +96,7 @@ def load_map(
     state = _state(path, arrays, emap.state, ids, header["version"])
     if header["version"] < VERSION:
         state = rate(state, emap.cfg, None if emap.head is None else emap.head.weights)
-    if predicts:  # such files mark cells that were filled by their support, and kept their bounds
+    if completes:  # such files mark cells that were filled by their support, and kept their bounds
         measured = forget_cells(state, state.validity & (state.support < 0))
         state = measured._replace(upper_bound=state.upper_bound, bounded=state.bounded)
     emap.load_state(state)

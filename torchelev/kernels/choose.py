@@ -65,7 +65,7 @@ def _why_no_kernels(layer: Tensor) -> str:
 def _why_not_built() -> str:
     if is_switched_off():
         return _SWITCHED_OFF
-    with contextlib.suppress(FileNotFoundError):  # CXX names none, of which a warning tells
+    with contextlib.suppress(FileNotFoundError):  # CXX names none, as a warning says
         if find_compiler() is None:
             return "no C++ compiler was found"
     return "the C++ could not be built, see the warning"

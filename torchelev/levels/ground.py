@@ -85,13 +85,13 @@ def choose_ground(
     Args:
         heights: of the ground and the other surfaces [m].
         known: which of them exist.
-        standing: where the way begins.
+        standing: where the search begins.
         grid: the window.
         cfg: `max_step` and `max_blind`.
         is_readable: whether the host may ask the device if the search is over.
 
     Returns:
-        Number of the surface, 0 the ground; NONE where only the guess came, or nothing.
+        Number of the surface, 0 for the ground; NONE where only the guess arrived, or nothing did.
         Whether the ground was reached at all.
     """
     B, K, H, W = heights.shape

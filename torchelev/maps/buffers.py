@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from torchelev.config import ElevationMapConfig, differing_fields
 from torchelev.errors import require
+from torchelev.files.config_files import split_off_completion
 from torchelev.grid import cell_centers, window_center
 from torchelev.state import CARRIED, MapState, Statistics, blank_state, map_layers
 
@@ -99,7 +100,7 @@ class MapBuffers(nn.Module):
         self._forget_derived()
         with torch.no_grad():
             map_layers(Tensor.copy_, self.state, state)
-            if self.cfg.traversability is None:  # no stage would rate these cells anew
+            if self.cfg.traversability is None:  # no stage would rate these cells again
                 self.state.rated.zero_(), self.state.traversability.zero_()
 
     def _forget_derived(self) -> None:
@@ -115,9 +116,9 @@ class MapBuffers(nn.Module):
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         """Load a checkpoint, or refuse one of another config before anything changes, naming the settings."""
         extra = state_dict.get(f"{prefix}_extra_state")
-        # Filters hold no state, weights come from this checkpoint, and only older versions had a completion.
-        ignored = ("filters", "traversability.weights", "completion")
-        fields = differing_fields(self.cfg.to_dict(), extra["config"]) if extra else []
+        ignored = ("filters", "traversability.weights")  # filters hold no state, weights come from this checkpoint
+        stored = split_off_completion(extra["config"])[0] if extra else self.cfg.to_dict()
+        fields = differing_fields(self.cfg.to_dict(), stored)
         fields = [name for name in fields if not name.startswith(ignored)]
         hint = "build the map with ElevationMapConfig.from_dict(checkpoint['_extra_state']['config'])"
         require(not fields, "state_dict", "must be of the same config", f"other {', '.join(fields)}", hint)

@@ -104,7 +104,7 @@ class RestartableMap(PaintedMap, ReadableMap):
         self._revise(lambda state: forget_cells(state, cells))
 
     def _revise(self, change: Callable[[MapState], MapState]) -> None:
-        """Change the heights besides updates, and rate the map anew."""
+        """Change the heights besides updates, and rate the map again."""
         self._derived.clear()
         with torch.no_grad():
             state = change(subtract_disagreement(self.state))

@@ -12,10 +12,11 @@ from torch import Tensor
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, require_positive, whole_cells
 from torchelev.levels.state import Levels
-from torchelev.observations import patterns, presets
-from torchelev.observations.presets import PRESETS
-from torchelev.observations.scan_reading import read_scan
-from torchelev.observations.scan_settings import ScanSettings
+from torchelev.observations import patterns
+from torchelev.observations.scan import presets
+from torchelev.observations.scan.presets import PRESETS
+from torchelev.observations.scan.reading import read_scan
+from torchelev.observations.scan.settings import ScanSettings
 from torchelev.state import MapState
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import Any
 
 from torchelev.errors import require
 from torchelev.files.config_files import to_json
-from torchelev.observations.scan_settings import ScanSettings
+from torchelev.observations.scan.settings import ScanSettings
 
 # Noise belongs to training, reach to the map's window; the placement follows from the pattern.
 _LEFT_OUT = ("noise", "noise_after_clip", "reach", "placement")

@@ -53,7 +53,7 @@ class VoxelCrop:
     resolution: float = 0.05  #: [m] side of a voxel
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  #: [m] centre of the crop from the base, in its heading
     values: str = "states"  #: "states" or "distances"
-    max_distance: float = 0.5  #: [m] beyond which distances are not told apart
+    max_distance: float = 0.5  #: [m] at which distances are cut off
     #: "yaw" turns the crop with the base's heading; "world" only moves it
     alignment: str = "yaw"
     _size: tuple[int, int, int] = field(init=False, repr=False, compare=False)

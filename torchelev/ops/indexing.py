@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def read(layer: Shaped[Tensor, "B *C"], index: Int[Tensor, "B *I"]) -> Shaped[Tensor, "B *I"]:
-    """Return the layer's value at each flat index; the layer is stored first, not computed anew for each index."""
+    """Return the layer's value at each flat index; the layer is stored first, not recomputed for each index."""
     values = layer.flatten(1)
     if index.ndim == 2:
         return values.gather(1, index)

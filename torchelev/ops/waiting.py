@@ -130,7 +130,7 @@ def num_cores() -> int:
 
 
 class RunningThreads:
-    """Counts the threads of all processes that run or wait for a core, as Linux tells it."""
+    """Counts the threads of all processes that run or wait for a core, as Linux reports it."""
 
     def __init__(self) -> None:
         self._file = os.open("/proc/loadavg", os.O_RDONLY | os.O_CLOEXEC)  # stays open: opening takes most of the time
@@ -141,7 +141,7 @@ class RunningThreads:
 
 
 def count_own_running() -> int:
-    """Count the threads of this process that run or wait for a core, as Linux tells it."""
+    """Count the threads of this process that run or wait for a core, as Linux reports it."""
     return sum(map(_is_running, os.listdir("/proc/self/task")))
 
 

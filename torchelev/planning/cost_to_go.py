@@ -12,8 +12,8 @@ from torchelev.errors import require, require_count, require_positive
 from torchelev.inputs.checks import FLOATS, require_indices, require_tensor
 from torchelev.ops.transforms import is_readable
 from torchelev.ops.windows import AROUND, neighbours
-from torchelev.planning import dijkstra
-from torchelev.planning.sweeps import iterate, step_cost
+from torchelev.planning.solvers import dijkstra
+from torchelev.planning.solvers.sweeps import iterate, step_cost
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -29,10 +29,11 @@ def cost_to_go(
     J(a) = min over the eight neighbours b of J(b) + |ab| (c_a + c_b) / 2, with J = 0 at passable goal cells. A diagonal
     step requires the two cells beside it to be passable: no path cuts a corner.
 
-    On a CPU by Dijkstra's algorithm in C++ (`planning.dijkstra`). Elsewhere, with `rounds` or without a compiler, by
-    value iteration, with the same result: a round sweeps over the rows forwards and backwards, then over the columns,
-    and each line uses the values just computed for the one before it. A sweep follows every path that keeps to its
-    direction to the end, so the rounds needed grow with the turns of a path, not with its cells. Not differentiable.
+    On a CPU by Dijkstra's algorithm in C++ (`solvers.dijkstra`). Elsewhere, with `rounds` or without a compiler, by
+    value iteration (`solvers.sweeps`), with the same result: a round sweeps over the rows forwards and backwards, then
+    over the columns, and each line uses the values just computed for the one before it. A sweep follows every path that
+    keeps to its direction to the end, so the rounds needed grow with the turns of a path, not with its cells. Not
+    differentiable.
 
     Args:
         cost: c, the cost of each metre in a cell: positive, inf where impassable.

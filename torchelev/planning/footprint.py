@@ -12,10 +12,10 @@ from torch import Tensor
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, require_positive
 from torchelev.inputs.checks import given_or_default
-from torchelev.planning.ceilings import lowest_ceiling, needed_height
-from torchelev.planning.ground_below import fit_below, read_ground
 from torchelev.planning.limits import ROUNDING, Limit, first_limit, limits_of
 from torchelev.planning.polygons import convex_hull
+from torchelev.planning.terrain.ceilings import lowest_ceiling, needed_height
+from torchelev.planning.terrain.ground import fit_below, read_ground
 from torchelev.state import MapState
 
 if TYPE_CHECKING:

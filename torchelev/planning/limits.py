@@ -28,7 +28,7 @@ ROUNDING = 1e-3  # [m], [rad] by which ground may exceed a limit
 
 
 class Limit(IntEnum):
-    """What makes ground impassable whatever its rating; `NONE`: its rating does, or that it is unknown.
+    """What makes ground impassable, whatever its rating; `NONE`: a low rating does, or that the ground is unknown.
 
     STEP, SLOPE and CLEARANCE are limits of the robot, CLASS is a forbidden class of `TraversalCostConfig.class_costs`,
     CEILING a surface too low above the ground for `TraversalCostConfig.height`.

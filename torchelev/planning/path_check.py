@@ -12,10 +12,10 @@ from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, require_count
 from torchelev.inputs.checks import given_or_default
 from torchelev.ops.transforms import is_readable
-from torchelev.planning.ceilings import describe_ceiling, needed_height
 from torchelev.planning.footprint import FootprintCheck, FootprintConfig, check_footprint
 from torchelev.planning.limits import Limits, limits_of
 from torchelev.planning.standing import MAX_CELL_OFFSET, check_polygon, check_poses, transform_polygon
+from torchelev.planning.terrain.ceilings import describe_ceiling, needed_height
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ class PathCheck(NamedTuple):
     poses: Float[Tensor, "B M 3"]  #: x, y [m] and yaw [rad], map frame; every `samples`-th is a given pose
     footprints: FootprintCheck  #: (B, M), at these places
     limits: Limits  #: of the robot, which hold besides the thresholds
-    height: float = 0.0  #: [m] of the robot, which what hangs above the ground must leave; 0 on maps without levels
+    height: float = 0.0  #: [m] clearance that the robot needs below ceilings; 0 on maps without levels
 
     def explain(self) -> list[str]:
         """Say for each path whether it is safe, else why not. The host waits for the device.

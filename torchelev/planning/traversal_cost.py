@@ -15,11 +15,11 @@ from torchelev.errors import require, require_positive
 from torchelev.inputs.checks import FLOATS, check_tensor, given_or_default
 from torchelev.layers import Layer
 from torchelev.ops.windows import padded, window_maximum
-from torchelev.planning.ceilings import too_low
 from torchelev.planning.class_costs import Costs, parse_costs, rate_classes
-from torchelev.planning.inclination import compute_inclination
 from torchelev.planning.limits import find_exceeded
 from torchelev.planning.standing import mark_standing_cells
+from torchelev.planning.terrain.ceilings import too_low
+from torchelev.planning.terrain.inclination import compute_inclination
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ def traversal_cost(
 
 
 class Obstruction(NamedTuple):
-    """What makes cells impassable, or their cost another, whatever their rating."""
+    """What makes cells impassable or changes their cost, whatever their rating."""
 
     exceeded: list[Bool[Tensor, "B H W"]]  #: the cells beyond each `Limit`, in their order
     factor: Float[Tensor, "B H W"] | None  #: on the cost of each cell; None: 1

@@ -165,7 +165,7 @@ class ElevationMappingNode(Node):
 
     def _warn(self, text: str, kind: str, pause: float = 5.0) -> None:
         """Log a warning, unless one of its kind was logged less than a pause [s] ago."""
-        now = time.monotonic()  # rclpy's own throttle tells kinds apart by the line that logs
+        now = time.monotonic()  # rclpy's own throttle distinguishes messages by the line that logs
         if now - self._warned.get(kind, -math.inf) >= pause:
             self._warned[kind] = now
             self.get_logger().warning(text)

@@ -22,9 +22,9 @@ from torchelev.kernels.cpu_update import Inputs
 from torchelev.kernels.registry import header
 from torchelev.kernels.structs import Double, members
 from torchelev.levels.config import MAX_HEIGHT, MAX_LEVELS, SEPARATIONS
-from torchelev.observations import presets
 from torchelev.observations.ground import MARGIN, MAX_BLOCK
 from torchelev.observations.height_scan import HeightScan
+from torchelev.observations.scan import presets
 from torchelev.pipeline import KERNELS, ORDER, ORDER_WITH_LEVELS, TENSORS
 from torchelev.plane_fit import MAX_RADIUS
 from torchelev.robot import RobotConfig

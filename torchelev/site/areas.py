@@ -1,4 +1,4 @@
-"""Where areas of a site lie on its lattice, and what is saved of them, here and over the network."""
+"""Place areas of a site on its lattice, and save them, from this process or over the network."""
 
 from __future__ import annotations
 

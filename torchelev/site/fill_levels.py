@@ -1,4 +1,4 @@
-"""Giving maps the levels that a site knows."""
+"""Fill maps with the levels that a site knows."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ import torch
 from torch import Tensor
 
 from torchelev.levels.state import SURFACE, Levels
+from torchelev.site.content.levels import SPACE
+from torchelev.site.content.tiles import Tiles, locate
 from torchelev.site.fusion.entries import rise
 from torchelev.site.fusion.stacks import Stack, read_stack
 from torchelev.site.fusion.windows import Contribution, read_known
 from torchelev.site.initialize_from_site import SUPPORT
-from torchelev.site.site_levels import SPACE
-from torchelev.site.tiles import Tiles, locate
 
 if TYPE_CHECKING:
     from jaxtyping import Bool
 
     from torchelev.elevation_map import ElevationMap
-    from torchelev.site.reading import Clock
+    from torchelev.site.content.reading import Clock
     from torchelev.state import MapState
 
 

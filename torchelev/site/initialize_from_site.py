@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,17 +15,54 @@ from torchelev.stages.initialize import Remembered, recall
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Int
+    from jaxtyping import Bool, Float, Int
 
     from torchelev.elevation_map import ElevationMap
+    from torchelev.site.content.reading import Clock
 
 SUPPORT = 6.0  # points that must disagree before a height of the site is replaced
 
 
-def move_contribution(
-    contribution: Contribution, corner: Int[Tensor, "B 2"], now: float, resolution: float
-) -> Contribution:
-    """Return a contribution with the windows at other corners, and as of another time [s]."""
+class Filled(NamedTuple):
+    """B maps with what a site knows in their unknown cells."""
+
+    state: MapState  #: of the maps
+    contribution: Contribution  #: with the filled cells, which the site has already
+
+
+def fill_windows(
+    state: MapState,
+    emap: ElevationMap,
+    known: Remembered,
+    contribution: Contribution,
+    chosen: Bool[Tensor, "B"],
+    clock: Clock,
+    resolution: float,
+) -> Filled:
+    """Fill the unknown cells of the chosen environments with what a site knows.
+
+    Args:
+        state: of the maps, with the windows where they will be.
+        emap: the map, for its settings.
+        known: what the site knows of these windows, NaN elsewhere.
+        contribution: of the maps, wherever their windows were then.
+        chosen: environments to fill.
+        clock: of the site.
+        resolution: [m].
+    """
+    contribution = _move(contribution, state.corner, clock.time, resolution)
+    after = _fill(state, emap, known, contribution, chosen, resolution)
+    return Filled(after, _add_filled(contribution, state, after, clock.rate, chosen))
+
+
+def spread(layers: Mapping[str, Tensor], ids: Int[Tensor, "K"], like: Float[Tensor, "B H W"]) -> Remembered:
+    """Return what a site knows of K of B windows as that of all windows, NaN of the others; no layers: of none."""
+    unknown = torch.full(like.shape, torch.nan, device=like.device)
+    return Remembered(*(unknown.index_copy(0, ids, layers[n]) if layers else unknown for n in Remembered._fields))
+
+
+def _move(contribution: Contribution, corner: Int[Tensor, "B 2"], now: float, resolution: float) -> Contribution:
+    """Return a contribution with the windows at other corners, as of another time [s]."""
     known = move_known(contribution.known, corner)
     passed = now - known.now
     age = known.age + passed[:, None, None]
@@ -37,15 +75,15 @@ def move_contribution(
     return contribution._replace(known=known, alignment=alignment, stack=stack)
 
 
-def fill(
+def _fill(
     state: MapState,
     emap: ElevationMap,
     known: Remembered,
     contribution: Contribution,
-    chosen: Tensor,
+    chosen: Bool[Tensor, "B"],
     resolution: float,
 ) -> MapState:
-    """Fill the unknown cells of the chosen environments with what a site knows, raised by how they lie above it."""
+    """Return the filled state: what the site knows, raised by the offset of each map above it."""
     place = torch.arange(state.elevation.numel(), device=chosen.device)
     robot = place // state.elevation[0].numel()
     above = rise(contribution.known, contribution.alignment, robot, place, resolution).view_as(known.elevation)
@@ -53,10 +91,10 @@ def fill(
     return recall(state, before, chosen, emap.cfg.fusion.max_variance, SUPPORT)
 
 
-def add_filled(
+def _add_filled(
     contribution: Contribution, before: MapState, after: MapState, rate: float, chosen: Bool[Tensor, "B"]
 ) -> Contribution:
-    """Return the contribution of B maps, with the cells that a site of this variance rate filled."""
+    """Return a contribution with the cells that a site of this variance rate filled."""
     filled, known = after.validity & ~before.validity, contribution.known
 
     def choose(new: Tensor, old: Tensor) -> Tensor:

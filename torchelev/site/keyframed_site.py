@@ -36,13 +36,13 @@ class KeyframedSite(VersionedSite):
     def move_keyframes(self, ids: Int[Tensor, "K"], T_map_base: Float[Tensor, "K 4 4"]) -> None:
         """Correct the poses of keyframes, as a pose graph does after it closed a loop.
 
-        The tiles below them are made again of all keyframes that lie there, in the order of their merges, so that the
-        site becomes what mapping with these poses from the start gives: exactly for corrections along z and by whole
+        The tiles below them are rebuilt from all keyframes there, in the order of their merges, so that the site
+        becomes what mapping with these poses from the start would give: exactly for corrections along z and by whole
         cells, otherwise to the nearest cell. A pose replaces the offset and tilt of its merge, too. Other tiles keep
         every bit. On disk, all of it is written or nothing.
 
-        The robots' own maps stay as they are. If they are not corrected, too, what they measure next lies where they
-        believe to be.
+        The robots' own maps stay as they are. Correct them, too: otherwise, what they measure next is placed by the old
+        poses.
 
         Args:
             ids: of the keyframes; see `keyframes`.

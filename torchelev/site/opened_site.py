@@ -13,7 +13,9 @@ import torch
 
 from torchelev.errors import require, require_positive
 from torchelev.inputs import checks
-from torchelev.site.channels import SiteChannels
+from torchelev.site.content.channels import SiteChannels
+from torchelev.site.content.levels import SiteLevels
+from torchelev.site.content.tiles import LAYERS, Tile, Tiles
 from torchelev.site.fusion.exchange import Exchange
 from torchelev.site.fusion.merge import Merged
 from torchelev.site.keyframes.keyframe_log import Arrays, KeyframeLog
@@ -22,10 +24,8 @@ from torchelev.site.shared.collective import shared_transaction
 from torchelev.site.shared.exchange import exchange_of
 from torchelev.site.shared.ranks import Ranks
 from torchelev.site.site_config import SiteConfig
-from torchelev.site.site_levels import SiteLevels
 from torchelev.site.storage.engines import open_store
 from torchelev.site.storage.interface import Note
-from torchelev.site.tiles import LAYERS, Tile, Tiles
 
 if TYPE_CHECKING:
     from jaxtyping import Int
@@ -96,13 +96,13 @@ class OpenedSite(ReadableSite):
         self, device: torch.device | str, channels: SiteChannels | None = None, levels: SiteLevels | None = None
     ) -> None:
         """Start with what is stored, or with nothing."""
-        if self._store is not None:  # of a site without channels, there may be no such attribute
+        if self._store is not None:  # a site without channels may lack the attribute
             channels = SiteChannels(self._store.attributes.get("channels"), LAYERS, self._store.layers)
             levels = SiteLevels.of(self._store.attributes)
         self._tiles = Tiles(self._store, self.cfg.cache_tiles, device, channels, levels)
         self._exchange = exchange_of(self._ranks)
         self._id, self._rate = uuid.uuid4().hex, self.cfg.variance_rate
-        self._epoch = self._time = self._opened = 0.0  # the last two count from the first
+        self._epoch = self._time = self._opened = 0.0  # the last two are relative to the first
         self._num_commits, self._interrupted, self._rasters, self._robots = 0, None, [], {}
         self._rollbacks: list[list[int]] = []
         self._read_attributes()
@@ -158,7 +158,7 @@ class OpenedSite(ReadableSite):
         self._id, self._rollbacks = stored.get("id", self._id), stored.get("rollbacks", [])
         self._robots = stored.get("robots", {})
         self._rasters, self._num_commits = list(stored.get("rasters", [])), stored.get("num_commits", 0)
-        if self._num_commits:  # of a new site, and one that went back to it, there is no more
+        if self._num_commits:  # a new site, or one rolled back to its start, has no more
             self._epoch, self._time = stored.get("epoch", 0.0), stored.get("time", 0.0)
             self._opened = self._time
             rate = self.cfg.variance_rate

@@ -15,9 +15,9 @@ from torchelev.errors import require
 from torchelev.io.export import SavedMap
 from torchelev.layers import MODES
 from torchelev.site.areas import place_area, save_area
-from torchelev.site.reading import Clock, check_layer, check_layers, read_area, sample_tiles
+from torchelev.site.content.reading import Clock, check_layer, check_layers, read_area, sample_tiles
+from torchelev.site.content.tiles import TILE, Tiles
 from torchelev.site.site_export import Moment, Place, choose_area, export
-from torchelev.site.tiles import TILE, Tiles
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int

@@ -19,8 +19,8 @@ from torchelev.files.output_files import MARK, atomic_file, require_writable
 from torchelev.io.export import SavedMap, triangulate, write_npz, write_ply
 from torchelev.io.geotiff import Bands, check_epsg, color_roles
 from torchelev.io.rasters.cog import BLOCK, write_cog
-from torchelev.site.reading import sources_of
-from torchelev.site.tiles import TILE, Tiles
+from torchelev.site.content.reading import sources_of
+from torchelev.site.content.tiles import TILE, Tiles
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

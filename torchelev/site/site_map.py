@@ -15,8 +15,11 @@ from torchelev.errors import require
 from torchelev.maps.centering import center_on
 from torchelev.ops.masks import count
 from torchelev.ops.storage import keep_freed_memory
+from torchelev.site import contributions
 from torchelev.site.areas import require_resolution
-from torchelev.site.channels import SiteChannels
+from torchelev.site.content.channels import SiteChannels
+from torchelev.site.content.levels import SiteLevels
+from torchelev.site.content.tiles import LAYERS, locate
 from torchelev.site.fill_levels import fill_levels
 from torchelev.site.fusion.align import align
 from torchelev.site.fusion.fuse_levels import read_surfaces
@@ -25,16 +28,14 @@ from torchelev.site.fusion.shares import Change, read_changes
 from torchelev.site.fusion.stacks import Change as SurfaceChange
 from torchelev.site.fusion.windows import (
     Alignment,
-    Contribution,
     Windows,
-    drop_reset,
     no_alignment,
     no_contribution,
     read_known,
     read_windows,
     snapshot,
 )
-from torchelev.site.initialize_from_site import add_filled, fill, move_contribution
+from torchelev.site.initialize_from_site import fill_windows, spread
 from torchelev.site.keyframed_site import KeyframedSite, require_poses
 from torchelev.site.keyframes.keyframe_log import KeyframeLog, arrays_of
 from torchelev.site.keyframes.keyframes import Recorded
@@ -44,12 +45,9 @@ from torchelev.site.shared.collective import open_shared
 from torchelev.site.shared.ranks import Ranks
 from torchelev.site.shared.shared_merge import gather_tiles, merge_shared
 from torchelev.site.site_config import SiteConfig
-from torchelev.site.site_levels import SiteLevels
 from torchelev.site.storage.interface import Note
 from torchelev.site.storage.versioned.repository import UncertainCommitError
-from torchelev.site.tiles import LAYERS, locate
 from torchelev.site.times import check_time, continue_time, warn_of_other_clock
-from torchelev.site.versioned_site import contributions
 from torchelev.stages.initialize import Remembered
 from torchelev.state import MapState, map_layers
 
@@ -60,7 +58,7 @@ if TYPE_CHECKING:
     from torchelev.levels.config import LevelsConfig
     from torchelev.site.storage.engines import Engine
 
-_FREED_BYTES = 96  # of a cell, which a merge takes and frees: faulted in anew, they take a tenth of its time
+_FREED_BYTES = 96  # of a cell, which a merge takes and frees: faulting them in again takes a tenth of its time
 
 
 class SiteMap(KeyframedSite, RasterSite):
@@ -74,13 +72,13 @@ class SiteMap(KeyframedSite, RasterSite):
     values, valid = site.sample(xy)
     ```
 
-    It is made of square tiles, of which a merge touches those below the windows alone. On disk, a merge is written
+    It is made of square tiles; a merge touches only those below the windows. On disk, a merge is written
     completely or not at all, and memory does not grow with the area. Each merge makes a version: see `versions`, `tag`,
     `rollback` and `compact`. Several processes may write to one site: those of a folder take turns; in an object store,
     the later one of two that meet merges on top of the earlier one.
 
     With a `group`, all its ranks hold one site, and `merge` takes the robots of all of them, in the order of the ranks:
-    call it on all ranks, which wait for each other and share the work. Reading is up to each rank. On disk, all ranks
+    call it on all ranks, which wait for each other and share the work. Each rank reads by itself. On disk, all ranks
     write to one folder, which all must see, and rank 0 commits. See `torchelev.site.shared.collective`.
 
     Args:
@@ -158,18 +156,18 @@ class SiteMap(KeyframedSite, RasterSite):
 
         First, the robots' heights are aligned with each other and with the site, as each has its own drift. Then their
         cells are fused by their variances; a robot's earlier share of a cell is replaced, so that nothing counts twice.
-        Heights that contradict each other are kept apart: the site says the newer one once it is about as sure, and
+        Heights that contradict each other are kept apart: the site shows the newer one once it is about as sure, and
         the layers `other_elevation`, `other_variance` and `other_time` hold the one that it contradicts. Channels that
         the site keeps are those of its elevation: means by weight, counts of classes added up, the largest of maxima,
         and of "exponential" and "class_average" what was measured last. Maps may lack channels that the site keeps.
         A site with levels takes all surfaces of maps with levels, and the ground of others; the lowest surface of each
-        cell is its ground. Surfaces are told apart by the site's `min_gap`, whatever those of the maps are.
+        cell is its ground. The site's `min_gap` separates surfaces, whatever that of the maps.
 
         Args:
             emap: the map, of the site's resolution. The site recognises it, not copies of it.
             time: [s] now, on any clock that all merges share, such as `time.time()`. A time before the site's newest
-                one, or more than a year after it, counts as it is, with a RuntimeWarning. None: the site's time goes on
-                by what the map has lived since its last merge.
+                one, or more than a year after it, counts as it is, with a RuntimeWarning. None: the site's time
+                advances by the map's elapsed time since its last merge.
             align: find the robots' offsets; otherwise their heights count as they are.
             tilt: also find how their windows tilt, in roll and pitch.
             T_map_base: the robots' poses, as they were given to `ElevationMap.update`. Required if keyframes are kept,
@@ -196,7 +194,7 @@ class SiteMap(KeyframedSite, RasterSite):
             T_map_base = require_poses(emap, T_map_base)
         if emap.device.type == "cpu":
             keep_freed_memory(_FREED_BYTES * emap.elevation.numel())
-        contribution = self._recall_contribution(emap)
+        contribution = contributions.recall(emap, self._id)
         if self._rate is None:
             self._rate = plans[0]["rate"]
         now = max(plan["now"] for plan in plans)  # of all ranks
@@ -227,14 +225,6 @@ class SiteMap(KeyframedSite, RasterSite):
         self._keep(emap, contribution)
         return MergeReport(*alignment, new_cells, contradictions)
 
-    def _recall_contribution(self, emap: ElevationMap) -> Contribution | None:
-        """Return a map's contribution since its last reset; None: it has not merged since."""
-        contribution = contributions.get(emap, {}).get(self._id)
-        if contribution is None:
-            return None
-        device = contribution.elapsed.device
-        return drop_reset(contribution, emap.num_resets.to(device), emap.state.elapsed.to(device))
-
     def _bring(self, emap: ElevationMap) -> MapState:
         """Return a map's state on the site's device."""
         device, state = self._tiles.device, emap.state
@@ -243,7 +233,7 @@ class SiteMap(KeyframedSite, RasterSite):
     def _plan(self, emap: ElevationMap, time: float | None, align: bool, tilt: bool) -> dict[str, Any]:
         """Return what this rank is about to merge; raise if it cannot."""
         self._check_merge(emap)
-        time, contribution = check_time(time), self._recall_contribution(emap)
+        time, contribution = check_time(time), contributions.recall(emap, self._id)
         elapsed = emap.state.elapsed.to(self._tiles.device)
         now = continue_time(elapsed, contribution, self._time, self._opened) if time is None else time
         merged = {"tiles": len(self), "time of the site": self.time}
@@ -267,7 +257,7 @@ class SiteMap(KeyframedSite, RasterSite):
         self._require_writable()
         rule, hint = "must be opened again by all ranks, with maps that are reset", "the last commit may be stored"
         require(not self._is_broken, "site", rule, "a group after a lost connection", hint)
-        self._require_not_taken_back(emap, contributions.get(emap, {}).get(self._id))
+        self._require_not_taken_back(emap, contributions.find(emap, self._id))
 
     def require_resolution(self, emap: ElevationMap) -> None:
         """Raise ValueError unless a map has the site's resolution."""
@@ -324,17 +314,15 @@ class SiteMap(KeyframedSite, RasterSite):
         """Return a map's state with what the site knows filled in; `ElevationMap.initialize_from` calls it."""
         self.require_resolution(emap)
         self._settle()
-        contribution, state, device = self._recall_contribution(emap), self._bring(emap), self._tiles.device
+        contribution, state = contributions.recall(emap, self._id), self._bring(emap)
         number = None if contribution is None else contribution.number
-        chosen = chosen.to(device)
+        device, chosen = self._tiles.device, chosen.to(self._tiles.device)
         if T_map_base is not None:
             state = center_on(state, emap, T_map_base.to(device), chosen)
         if contribution is None:
             contribution = no_contribution(read_known(emap, state, self._time), emap.num_resets.to(device))
-        contribution = move_contribution(contribution, state.corner, self._time, self.resolution)
         known = self._read_chosen(state, chosen)
-        after = fill(state, emap, known, contribution, chosen, self.resolution)
-        filled = add_filled(contribution, state, after, self._clock.rate, chosen)
+        after, filled = fill_windows(state, emap, known, contribution, chosen, self._clock, self.resolution)
         if self._tiles.levels:
             filled = fill_levels(emap, state, after, self._tiles, filled, chosen, self._clock, self.resolution)
         self._keep(emap, filled, number)
@@ -344,8 +332,7 @@ class SiteMap(KeyframedSite, RasterSite):
         """Return what the site knows of the windows of the chosen environments, NaN of others."""
         ids, size = chosen.nonzero()[:, 0], state.elevation.shape[1:]
         areas = self.windows(state.corner[ids], size[0], size[1], Remembered._fields) if len(ids) else {}
-        unknown = torch.full(state.elevation.shape, torch.nan, device=chosen.device)
-        return Remembered(*(unknown.index_copy(0, ids, areas[n]) if areas else unknown for n in Remembered._fields))
+        return spread(areas, ids, state.elevation)
 
 
 def describe_merge(num_robots: int, num_cells: int) -> Note:

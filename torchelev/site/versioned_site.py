@@ -6,9 +6,9 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, TypeVar
-from weakref import WeakKeyDictionary
 
 from torchelev.errors import message, require
+from torchelev.site import contributions
 from torchelev.site.fusion.windows import Contribution
 from torchelev.site.opened_site import OpenedSite
 from torchelev.site.storage.interface import InDoubtError, Overtaken
@@ -18,9 +18,6 @@ if TYPE_CHECKING:
     from torchelev.site.storage.interface import SiteStore, Version
 
 T = TypeVar("T")
-
-# By map and site: a map's contribution. Of all sites of a process, so that a site may be closed and opened again.
-contributions: WeakKeyDictionary[ElevationMap, dict[str, Contribution]] = WeakKeyDictionary()
 
 
 class VersionedSite(OpenedSite):
@@ -62,7 +59,7 @@ class VersionedSite(OpenedSite):
 
         Raises:
             KeyError: there is no such version.
-            ValueError: the name is or was taken or is none, or the site is read-only, closed, in memory or of files.
+            ValueError: the name is invalid, is or was taken, or the site is read-only, closed, in memory or of files.
             OSError: the store cannot be written.
         """
         store = self._require_store("tag")
@@ -122,7 +119,7 @@ class VersionedSite(OpenedSite):
     # Turns -----------------------------------------------------------------------------------------------------------
 
     def _in_turn(self, work: Callable[[], T]) -> T:
-        """Return what `work` returns, which commits on top of the newest version; overtaken, it is called again.
+        """Call `work`, which commits on top of the newest version, until no other writer is faster; return its result.
 
         Raises:
             OSError: another process writes beside a group, or as of `work`.
@@ -168,7 +165,7 @@ class VersionedSite(OpenedSite):
     def _keep(self, emap: ElevationMap, contribution: Contribution, number: int | None = None) -> None:
         """Remember what a map has contributed; `number`: of the commit, None: the last one."""
         number = self._num_commits if number is None else number
-        contributions.setdefault(emap, {})[self._id] = contribution._replace(number=number)
+        contributions.keep(emap, self._id, contribution._replace(number=number))
 
     def _require_not_taken_back(self, emap: ElevationMap, contribution: Contribution | None) -> None:
         """Raise ValueError if a rollback has taken back the last merge of a map that has not been reset since."""
@@ -181,7 +178,7 @@ class VersionedSite(OpenedSite):
         require(not (is_taken_back and bool(goes_on.any())), "emap", rule, actual, "call emap.reset()")
 
     def _compact_in_time(self) -> None:
-        """Compact once in `keep_versions` merges; a failure is no merge's."""
+        """Compact once in `keep_versions` merges; if that fails, the merge still holds."""
         if self._store is None or self._ranks.rank or self._num_commits % self.cfg.keep_versions:
             return
         try:

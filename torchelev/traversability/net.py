@@ -10,18 +10,11 @@ import torch
 from torch import Tensor, nn
 
 from torchelev.errors import require
-from torchelev.files.weight_files import write_weights
 from torchelev.robot import RobotConfig
 from torchelev.traversability.rate import rate
 from torchelev.traversability.rating import Rating
-from torchelev.traversability.weight_file import (
-    FORMAT,
-    RANGES,
-    VERSION,
-    Weights,
-    require_in_ranges,
-    weight_shapes,
-)
+from torchelev.traversability.trained_range import RANGES, require_in_ranges
+from torchelev.traversability.weight_file import Weights, read_weights, weight_shapes, write_weights
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -37,7 +30,7 @@ class TraversabilityNet(nn.Module):
     Args:
         cell_channels: width of the layer that describes a cell.
         stance_channels: width of the layer that rates a robot at one heading.
-        ranges: limits of the ratios (`weight_file.ratios`) of the robots that the head is trained for; None: RANGES.
+        ranges: limits of the ratios (`trained_range.ratios`) of the robots that the head is trained for; None: RANGES.
     """
 
     def __init__(
@@ -123,7 +116,7 @@ class TraversabilityNet(nn.Module):
         Raises:
             WriteError: if the file cannot be written.
         """
-        write_weights(path, VERSION, self.config, self.state_dict())
+        write_weights(path, self.config, self.state_dict())
 
     @classmethod
     def from_pretrained(cls, path: str | Path | None = None) -> TraversabilityNet:
@@ -136,7 +129,10 @@ class TraversabilityNet(nn.Module):
             FileNotFoundError: if there is no such file.
             ValueError: if it does not hold finite weights of this version.
         """
-        return FORMAT.build(_PRETRAINED if path is None else Path(path), cls)
+        config, state = read_weights(_PRETRAINED if path is None else Path(path))
+        net = cls(**config)
+        net.load_state_dict(state)
+        return net
 
 
 def _check_layers(

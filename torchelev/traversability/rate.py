@@ -15,7 +15,8 @@ from torchelev.robot import RobotConfig
 from torchelev.traversability.attitude import attitudes
 from torchelev.traversability.features import complete, extremes, features, widened_maximum
 from torchelev.traversability.stances import Scales, in_cells
-from torchelev.traversability.weight_file import Weights, conditions
+from torchelev.traversability.trained_range import conditions
+from torchelev.traversability.weight_file import Weights
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -25,7 +26,7 @@ def _condition(bias: Float[Tensor, "O"], weight: Float[Tensor, "O N"], values: l
     """Return bias + weight @ values."""
     for column, value in zip(weight.unbind(1), values, strict=True):
         bias = torch.add(bias, column, alpha=value)  # a constant of a compiled graph, where a tensor would be copied
-    return bias  # else every cell would compute it anew
+    return bias  # else every cell would compute it again
 
 
 def _mix(

@@ -1,23 +1,26 @@
-"""The learned head's weights: their shapes, the file that holds them, and the robots that they are trained for."""
+"""The learned head's weights: their shapes, and the file that holds them, checked before use."""
 
 from __future__ import annotations
 
-import math
+import io
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import torch
 from torch import Tensor
 
-from torchelev.errors import require
-from torchelev.files.weight_files import WeightFormat, is_within, require_resolution
-from torchelev.robot import RobotConfig
+from torchelev.errors import message, require
+from torchelev.files.output_files import atomic_file
 from torchelev.traversability.features import NUM_FEATURES
+from torchelev.traversability.trained_range import RANGES
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 VERSION = 2  # of the file format
 _CONFIG_KEYS = {"cell_channels", "stance_channels", "ranges"}
+_RULE, _HINT = "must be a file of weights", "write it with TraversabilityNet.save"
 
 
 class Weights(NamedTuple):
@@ -64,45 +67,38 @@ def weight_shapes(cell_channels: int, stance_channels: int) -> dict[str, tuple[i
     )
 
 
-def ratios(robot: RobotConfig, resolution: float) -> dict[str, float]:
-    """Return a robot's proportions, which its windows and dimensionless heights do not contain."""
-    return {
-        "robot.width / length": robot.width / robot.length,
-        "robot.clearance / step_height": robot.clearance / robot.step_height,
-        "robot.foot_radius / length": robot.foot_radius / robot.length,
-        "robot.foot_reach / length": robot.foot_reach / robot.length,
-        "tan(robot.max_slope) * length / step_height": math.tan(robot.max_slope) * robot.length / robot.step_height,
-        "resolution / robot.length": resolution / robot.length,
-        "robot.step_height": robot.step_height,  # [m] as sensor noise and drift do not scale with the robot
-    }
+def write_weights(path: str | Path, config: Mapping[str, Any], state: Mapping[str, Tensor]) -> None:
+    """Write a head's config and weights to a file. Raises WriteError if it cannot be written."""
+    content = io.BytesIO()  # written to a file by torch itself, a full disk would raise RuntimeError
+    torch.save({"version": VERSION, "config": dict(config), "state_dict": dict(state)}, content)
+    with atomic_file(path) as file:
+        file.write(content.getbuffer())
 
 
-# Limits of the ratios of the robots that a head is trained for by default.
-RANGES = {
-    "robot.width / length": (0.4, 0.8),
-    "robot.clearance / step_height": (0.85, 3.4),
-    "robot.foot_radius / length": (0.03, 0.06),
-    "robot.foot_reach / length": (0.1, 0.2),
-    "tan(robot.max_slope) * length / step_height": (0.88, 5.7),
-    "resolution / robot.length": (0.02, 0.25),
-    "robot.step_height": (0.06, 0.35),
-}
+def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Return the config and the weights of a head from a file.
 
-
-def conditions(robot: RobotConfig, resolution: float) -> list[float]:
-    """Return the logarithms of the ratios, scaled to -1 and 1 at the limits in RANGES."""
-    logs = ((math.log(ratio), *map(math.log, RANGES[name])) for name, ratio in ratios(robot, resolution).items())
-    return [(2 * value - low - high) / (high - low) for value, low, high in logs]
-
-
-def require_in_ranges(ranges: Mapping[str, tuple[float, float]], robot: RobotConfig, resolution: float) -> None:
-    """Refuse a resolution outside RESOLUTIONS, and a robot whose ratios are outside the ranges."""
-    require_resolution(resolution)
-    hint = "train a head for this robot: python -m training.traversability --robot ..."
-    for name, ratio in ratios(robot, resolution).items():
-        low, high = ranges[name]
-        fits = is_within(ratio, ranges[name])
-        require(fits, name, f"must be within {low:.3g} to {high:.3g}, as trained", f"{ratio:.4g}", hint)
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if the file is damaged, holds anything else or weights of another version, or some are not finite.
+    """
+    where, train = str(path), "train weights: python -m training.traversability"
+    require(path.exists(), where, _RULE, "no file", train, FileNotFoundError)
+    require(not path.is_dir(), where, _RULE, "a folder", _HINT)
+    try:
+        found = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # the type depends on which byte is damaged
+        refused = f"a file that torch.load refuses ({type(error).__name__})"
+        raise ValueError(message(where, _RULE, refused, _HINT)) from error
+    actual = found.get("version") if isinstance(found, dict) else None
+    require(isinstance(actual, int), where, _RULE, "a file of something else", _HINT)
+    require(actual == VERSION, where, f"must be of version {VERSION}", actual, "train with this torchelev")
+    config, state = found.get("config"), found.get("state_dict")
+    fits = isinstance(config, dict) and isinstance(state, dict) and _is_config(config)
+    fits = fits and all(isinstance(value, Tensor) for value in state.values())
+    require(fits, where, _RULE, "those of another network", _HINT)
+    _check_weights(where, weight_shapes(config["cell_channels"], config["stance_channels"]), state)
+    return config, state
 
 
 def _is_config(config: dict[str, Any]) -> bool:
@@ -115,4 +111,11 @@ def _is_config(config: dict[str, Any]) -> bool:
     return has_sizes and has_ranges and all(len(pair) == 2 for pair in ranges.values())
 
 
-FORMAT = WeightFormat(VERSION, _is_config, "TraversabilityNet.save", "python -m training.traversability")
+def _check_weights(where: str, shapes: dict[str, tuple[int, ...]], state: Mapping[str, Tensor]) -> None:
+    """Refuse weights of other names or shapes than expected, and weights that are not finite."""
+    found = {name: tuple(value.shape) for name, value in state.items()}
+    wrong = [name for name in shapes | found if shapes.get(name) != found.get(name)]
+    text = ", ".join(f"{name} {found.get(name)} instead of {shapes.get(name)}" for name in wrong)
+    require(not wrong, where, "must hold weights of the shapes that its config says", text, "train them again")
+    bad = ", ".join(name for name, value in state.items() if not bool(torch.isfinite(value).all()))
+    require(not bad, where, "must be finite", f"NaN or inf in {bad}", "train them again")

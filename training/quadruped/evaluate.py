@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from envs.quadruped import Quadruped, QuadrupedConfig
-from envs.quadruped.task import ENDINGS
+from envs.quadruped.episode.outcome import ENDINGS
 from torchelev.app.results import markdown_table
 
 Policy = Callable[[Any], Tensor]

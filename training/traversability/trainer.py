@@ -11,10 +11,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchelev.errors import require, require_positive
-from torchelev.files.weight_files import RESOLUTIONS
 from torchelev.robot import RobotConfig
 from torchelev.traversability.net import TraversabilityNet
-from torchelev.traversability.weight_file import ratios
+from torchelev.traversability.trained_range import RESOLUTIONS, ratios
 from training.fit import Fit
 from training.traversability.maps.data import MappedTerrain
 from training.traversability.metrics import SAFE

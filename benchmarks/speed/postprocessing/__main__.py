@@ -22,7 +22,7 @@ import torch
 from numpy.typing import NDArray
 
 from benchmarks import RESULTS
-from benchmarks.speed import meter
+from benchmarks.speed.common import meter
 from benchmarks.speed.postprocessing import peers
 from benchmarks.speed.postprocessing.peers import RESOLUTION, Peer
 from torchelev import filters, planes

@@ -24,7 +24,7 @@ import click
 import torch
 
 from benchmarks import RESULTS
-from benchmarks.speed.meter import in_new_process, milliseconds, peak_megabytes, progress, state_bytes
+from benchmarks.speed.common.meter import in_new_process, milliseconds, peak_megabytes, progress, state_bytes
 from benchmarks.speed.site.site_windows import RESOLUTION, Windows
 from torchelev.app.results import markdown_table, write_json
 from torchelev.site import SiteMap

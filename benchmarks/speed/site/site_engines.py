@@ -28,7 +28,7 @@ import numpy as np
 import torch
 
 from benchmarks import RESULTS
-from benchmarks.speed.meter import in_new_process, peak_megabytes, progress
+from benchmarks.speed.common.meter import in_new_process, peak_megabytes, progress
 from benchmarks.speed.site.site_windows import RESOLUTION, Windows, lattice
 from torchelev.app.results import markdown_table, write_json
 from torchelev.site import SiteConfig, SiteMap

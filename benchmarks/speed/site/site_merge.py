@@ -21,7 +21,7 @@ import click
 import torch
 
 from benchmarks import RESULTS
-from benchmarks.speed.meter import peak_bytes, progress
+from benchmarks.speed.common.meter import peak_bytes, progress
 from benchmarks.speed.site.site_windows import RESOLUTION, Windows, lattice
 from torchelev.app.results import markdown_table, write_json
 from torchelev.site import SiteMap

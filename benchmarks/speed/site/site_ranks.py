@@ -27,7 +27,7 @@ import torch.distributed as dist
 import torch.multiprocessing as multiprocessing
 
 from benchmarks import RESULTS
-from benchmarks.speed.meter import peak_megabytes, progress
+from benchmarks.speed.common.meter import peak_megabytes, progress
 from benchmarks.speed.site.site_windows import RESOLUTION, Windows, lattice
 from torchelev.app.results import markdown_table, write_json
 from torchelev.site import SiteMap

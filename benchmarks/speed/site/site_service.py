@@ -30,7 +30,7 @@ from torchelev import ElevationMap, ElevationMapConfig, GridConfig
 from torchelev.app.results import markdown_table, write_json
 from torchelev.site import SiteMap
 from torchelev.site.service import RobotLink
-from torchelev.site.service.transport import ZenohChannel, open_session
+from torchelev.site.service.wire.transport import ZenohChannel, open_session
 
 RESOLUTION, LENGTH, ROBOTS = 0.1, 8.0, 8
 SPACING = 6.0  # [m] between the robots, whose windows overlap

@@ -9,7 +9,7 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, NullFormatter, NullLocator, ScalarFormatter
 
-from benchmarks.speed.workload import SENSORS
+from benchmarks.speed.common.workload import SENSORS
 from torchelev.viz.style import make_figure, save, styled
 
 Panel = Callable[[Axes, dict[str, Any]], None]

@@ -8,9 +8,9 @@ from typing import Any
 
 import torch
 
-from benchmarks.speed import meter
-from benchmarks.speed.meter import progress
-from benchmarks.speed.workload import BPEARL, MANY_POINTS, SENSORS, Drive, baseline_config, full_config
+from benchmarks.speed.common import meter
+from benchmarks.speed.common.meter import progress
+from benchmarks.speed.common.workload import BPEARL, MANY_POINTS, SENSORS, Drive, baseline_config, full_config
 from torchelev.stages.visibility.polar_table import PolarGrid
 
 THREADS = (1, 2)

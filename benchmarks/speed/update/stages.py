@@ -9,9 +9,9 @@ from typing import Any
 
 import torch
 
-from benchmarks.speed import meter
-from benchmarks.speed.meter import progress
-from benchmarks.speed.workload import BPEARL, MANY_POINTS, Drive, full_config
+from benchmarks.speed.common import meter
+from benchmarks.speed.common.meter import progress
+from benchmarks.speed.common.workload import BPEARL, MANY_POINTS, Drive, full_config
 from torchelev import pipeline
 from torchelev.inputs.update_inputs import Inputs
 from torchelev.kernels.cpu_update import as_inputs, compiled_stages

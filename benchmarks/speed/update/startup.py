@@ -11,13 +11,13 @@ from typing import Any
 
 import torch
 
-from benchmarks.speed.meter import progress
+from benchmarks.speed.common.meter import progress
 
 _IMPORT = "import time, torch; t = time.perf_counter(); import torchelev; print(time.perf_counter() - t)"
 # Imports nothing that a user's program does not, as its memory is measured, too.
 _FIRST_UPDATE = """
 import time, torch
-from benchmarks.speed.workload import BPEARL, Drive, full_config
+from benchmarks.speed.common.workload import BPEARL, Drive, full_config
 torch.set_num_threads({threads})
 drive = Drive(full_config(), BPEARL, scans=1)
 t = time.perf_counter()

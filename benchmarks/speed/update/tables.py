@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-from benchmarks.speed.workload import BPEARL, SENSORS
+from benchmarks.speed.common.workload import BPEARL, SENSORS
 from torchelev.app.results import markdown_table
 
 TARGETS = {6276: 2.0, 43074: 4.0, 407040: 16.0}  # [ms] one robot

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from benchmarks.speed import bag_drive, bags
+from benchmarks.speed import bags
+from benchmarks.speed.common import bag_drive
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig
 from torchelev.io import MappingRun
 from torchelev.io.bags import Bag, open_bag

@@ -8,8 +8,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from benchmarks.speed import growth, long_run
-from benchmarks.speed.workload import Drive, full_config
+from benchmarks.speed import long_run
+from benchmarks.speed.common import growth
+from benchmarks.speed.common.workload import Drive, full_config
 
 
 @pytest.mark.slow(3)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from torchelev.io import RecordingError, read_cloud
-from torchelev.io.clouds import read_cloud_file
+from torchelev.io.files.clouds import read_cloud_file
 
 POINTS = np.random.default_rng(0).uniform(-5, 5, (4992, 6)).astype(np.float32)
 

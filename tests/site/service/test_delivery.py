@@ -11,8 +11,8 @@ import torch
 from tests.site.helpers import known_cells
 from tests.site.service.walks import START, Network, Walker, assert_same
 from torchelev.site import SiteMap
-from torchelev.site.service.merger import SiteServer
 from torchelev.site.service.outbox import Outbox
+from torchelev.site.service.server.merger import SiteServer
 
 
 @pytest.fixture(autouse=True)

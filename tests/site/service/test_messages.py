@@ -11,11 +11,12 @@ from hypothesis import given
 
 from tests.site.service.walks import START, Network, Walker
 from torchelev.io.errors import RecordingError
-from torchelev.site.service import SiteServer, messages
-from torchelev.site.service.access import read_keys
-from torchelev.site.service.messages import MAX_MESSAGE, MessageError, decode, encode
+from torchelev.site.service import SiteServer
 from torchelev.site.service.outbox import Outbox
 from torchelev.site.service.questions import ask_areas, read_answer
+from torchelev.site.service.wire import messages
+from torchelev.site.service.wire.access import read_keys
+from torchelev.site.service.wire.messages import MAX_MESSAGE, MessageError, decode, encode
 
 LAYOUT = [("height", "float32", (3, 4)), ("mask", "bool", (3, 5)), ("corner", "int64", (2,)), ("now", "float64", ())]
 

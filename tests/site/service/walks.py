@@ -9,8 +9,8 @@ from tests.helpers import pose, seen_from, small_map
 from tests.site.helpers import ground, known_cells
 from torchelev import AgingConfig
 from torchelev.site import SiteMap
-from torchelev.site.service.merger import SiteServer
 from torchelev.site.service.outbox import Outbox
+from torchelev.site.service.server.merger import SiteServer
 from torchelev.site.service.snapshots import read_snapshot
 
 START = 1.7e9  # [s] on the clock that all share

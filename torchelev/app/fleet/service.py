@@ -18,7 +18,7 @@ from torchelev.errors import require
 from torchelev.io.export import SavedMap
 from torchelev.site import MergeReport, SiteMap
 from torchelev.site.service import RobotLink
-from torchelev.site.service.transport import ZenohChannel, open_session
+from torchelev.site.service.wire.transport import ZenohChannel, open_session
 
 _NAME = "fleet"
 _PATIENCE = 30.0  # [s] for the merger to acknowledge, and to end
@@ -48,7 +48,7 @@ class FleetService:
         ]
 
     def merge(self, emap: ElevationMap) -> MergeReport:
-        """Let all robots publish, wait until the site has it, and return what the merger told each of them."""
+        """Let all robots publish, wait until the site has it, and return the merger's report on each of them."""
         now = self._start + 1e-9 * float(emap.state.elapsed.max())
         for link in self.links:
             link.publish(now)

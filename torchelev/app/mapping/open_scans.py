@@ -144,7 +144,7 @@ def _require_odometry(request: MapRequest) -> None:
 
 
 def _require_semantic(request: MapRequest) -> None:
-    """Refuse options that only --semantic reads, and names that are none."""
+    """Refuse options that only --semantic reads, and invalid names of classes."""
     for name in ("semantic_info", "classes"):
         if getattr(request, name) is not None and request.semantic is None:
             raise ValueError(f"--{name.replace('_', '-')}: only with --semantic; give --semantic TOPIC")

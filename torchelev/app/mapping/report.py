@@ -38,7 +38,7 @@ def summarize(run: MappingRun, num_scans: int) -> list[str]:
 
 
 def _describe_channels(emap: ElevationMap) -> Iterator[str]:
-    """Yield for each channel in how many of the known cells it says something."""
+    """Yield for each channel in how many of the known cells it is known."""
     known = emap.layer("validity")[0] > 0
     for name in emap.cfg.channels if known.any() else ():
         share = float(emap.read_channel(name)[1][0][known].float().mean())

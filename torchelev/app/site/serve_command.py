@@ -17,7 +17,7 @@ import click
 from torchelev.app.user_error import user_errors
 
 if TYPE_CHECKING:
-    from torchelev.site.service.merger import Merged
+    from torchelev.site.service.server.merger import Merged
 
 _REFRESH = 1.0  # [s] between lines
 
@@ -74,10 +74,10 @@ def ended_by_signals() -> Iterator[threading.Event]:
 def run_serve(request: ServeRequest) -> None:
     """Run `torchelev site serve` until Ctrl-C."""
     with user_errors():
-        from torchelev.site.service.access import read_keys
-        from torchelev.site.service.merger import SiteServer
-        from torchelev.site.service.serve import NetworkedServer
-        from torchelev.site.service.transport import import_zenoh
+        from torchelev.site.service.server.merger import SiteServer
+        from torchelev.site.service.server.serve import NetworkedServer
+        from torchelev.site.service.wire.access import read_keys
+        from torchelev.site.service.wire.transport import import_zenoh
 
         import_zenoh()
         keys = None if request.robots is None else read_keys(request.robots)

@@ -18,7 +18,7 @@ around them. Needs torchelev[serve].
   torchelev site serve hill/ --connect tcp/127.0.0.1:7447    a router, such as rmw_zenoh's
   torchelev site serve hill/ --robots robots.yaml       only these robots may write
 
-What a robot is told to be merged is on disk. Ctrl-C ends it after the merge
+What the merger acknowledges is on disk. Ctrl-C ends it after the merge
 that is under way; robots keep what they have until it runs again.
 """
 
@@ -48,9 +48,7 @@ that is under way; robots keep what they have until it runs again.
     metavar="FILE",
     help="YAML with a line `name: key` for each robot that may write.  [default: all that connect may]",
 )
-@click.option(
-    "--align/--no-align", default=True, show_default=True, help="Find how much each robot's heights lie too high."
-)
+@click.option("--align/--no-align", default=True, show_default=True, help="Find the height offset of each robot.")
 @click.option("--quiet", is_flag=True, help="Print no line for each merge.")
 def serve_command(**options: Any) -> None:
     """Run `torchelev site serve`; its help text is `_HELP`."""

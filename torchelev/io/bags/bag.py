@@ -117,7 +117,7 @@ class Bag:
     def read(self, topics: Sequence[str]) -> Iterator[Message]:
         """Read the messages of some topics in the order of their recording, one at a time.
 
-        A bag that is damaged ends there, see `ended_early`. Messages that cannot be decoded are left out.
+        A damaged bag ends at the damage, see `ended_early`. Messages that cannot be decoded are left out.
         """
         channels = self._channels(topics)
         if not channels:

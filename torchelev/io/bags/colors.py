@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from torchelev.io.bags.bag import Bag
 from torchelev.io.errors import RecordingError
-from torchelev.io.point_colors import color_fields
+from torchelev.io.points.colors import color_fields
 
 _HINT = "give --points with a topic whose points have rgb or rgba, or leave --colour out"
 

@@ -29,7 +29,7 @@ class PoseCovariances:
         self._unknown: dict[str, float] = {}  # largest variance of each axis that was not measured
 
     def add(self, message: Any, stamp: float | None = None) -> None:
-        """Add that of a nav_msgs/Odometry, unless it is not filled in: all zeros, or not finite.
+        """Add the covariance of a nav_msgs/Odometry; one that is not filled in (all zeros, or not finite) is left out.
 
         Variances above 1000 m^2 or pi^2 mean "not measured": these axes count as known, see `notes`.
         """

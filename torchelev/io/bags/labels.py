@@ -80,7 +80,7 @@ class LabelTopic:
             try:
                 labels = read_labels(message.data)
             except CloudError:
-                continue  # is said when it is to be painted
+                continue  # reported when it is to be painted
             largest = max(largest, int(np.max(labels, where=~_is_void(labels), initial=0)))
         if largest >= _MAX_CLASSES:
             reason = f"--semantic {self.name} holds labels up to {largest}, more than {_MAX_CLASSES} classes"

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from torchelev.io.bags.messages.cloud import Cloud, CloudError
 from torchelev.io.bags.messages.raw import as_bytes
-from torchelev.io.point_colors import color_fields, to_colors
-from torchelev.io.point_times import TIME_FIELDS, describe_times, to_seconds
+from torchelev.io.points.colors import color_fields, to_colors
+from torchelev.io.points.times import TIME_FIELDS, describe_times, to_seconds
 
 __all__ = ["Cloud", "CloudError", "read_points", "to_seconds"]
 

@@ -81,7 +81,7 @@ class BagRecording:
 
     @property
     def ended_early(self) -> str:
-        """Where and why the bag could not be read on; "" if it could."""
+        """Where and why reading stopped before the end of the bag; "" if it did not."""
         return self._bag.ended_early
 
     @property

@@ -115,7 +115,7 @@ NODE_PARAMETERS = frozenset(
 def read_same_parameters(given: Mapping[str, Any], folder: Path) -> tuple[dict[str, Any], list[str]]:
     """Return the nested settings of a map that computes as elevation_mapping_cupy does, and the notes.
 
-    The file of weights is seen from `folder`.
+    The path of the weights is relative to `folder`.
     """
     same = {name: value for name, value in given.items() if name in DEFAULTS}
     same = {name: _switch(name, value) if name in SWITCHES else value for name, value in same.items()}

@@ -16,7 +16,7 @@ class Plugin(NamedTuple):
     filter: str | None  #: the filter that computes the same; None: there is none
     settings: tuple[str, ...] = ()  #: that it takes
     source: str = "elevation"  #: the layer that it reads by default
-    note: str = ""  #: what is to know
+    note: str = ""  #: what to know about it
 
 
 PLUGINS: dict[str, Plugin] = {

@@ -1,4 +1,4 @@
-"""Formats of single files: arrays, PCD, layouts of binary files and pose files, intrinsics of cameras.
+"""Single files: clouds and depth images of any format; arrays, PCD, layouts of binary and pose files, intrinsics.
 
-`torchelev.io.clouds`, `.depth` and `.poses` read files of all formats. Nothing here knows folders or bags.
+Pose files of any format are read by `torchelev.io.poses`. Nothing here knows folders or bags.
 """

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchelev.io.errors import RecordingError
-from torchelev.io.point_colors import color_fields, to_colors
-from torchelev.io.point_times import TIME_FIELDS
+from torchelev.io.points.colors import color_fields, to_colors
+from torchelev.io.points.times import TIME_FIELDS
 
 MAX_COLUMNS = 16  # numbers per point; wider arrays are images, or have one column per point
 _TIME_ARRAYS = (*TIME_FIELDS, "times", "timestamps")  # beside the points of a .npz

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchelev.errors import require
-from torchelev.io.clouds import read_cloud_file
-from torchelev.io.depth import read_depth, read_depth_points
 from torchelev.io.errors import RecordingError
 from torchelev.io.files.arrays import CloudFile
+from torchelev.io.files.clouds import read_cloud_file
+from torchelev.io.files.depth import read_depth, read_depth_points
 from torchelev.io.files.intrinsics import Intrinsics, read_intrinsics
 from torchelev.io.files.layout import FileLayout
 from torchelev.io.folders.clock import ScanClock, find_clock

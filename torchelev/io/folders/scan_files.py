@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from torchelev.files.output_files import is_own_output
-from torchelev.io.clouds import CLOUD_SUFFIXES
 from torchelev.io.errors import RecordingError
+from torchelev.io.files.clouds import CLOUD_SUFFIXES
 
 # Files of these types may lie beside point clouds; any other file there is an error, not silently skipped.
 _IGNORED_SUFFIXES = {"", *".txt .csv .json .yaml .yml .md .log .png .jpg .jpeg .mp4 .gif .bag .mcap .db3".split()}

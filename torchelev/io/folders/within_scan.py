@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torchelev.frames import deskew
 from torchelev.io.files.arrays import CloudFile
 from torchelev.io.notes import Note
-from torchelev.io.point_times import describe_times, longest_scan, to_seconds
+from torchelev.io.points.times import describe_times, longest_scan, to_seconds
 
 _MAX_GAP = 1.0  # [s] between poses, between which the motion is unknown
 _MAX_OUTSIDE = 0.2  # [s] by which points may be older than the first pose or younger than the last

@@ -1,4 +1,4 @@
-// Height scans of many robots: scan_reading.py. The points that are read decide what is computed, not the window.
+// Height scans of many robots: scan/reading.py. The points that are read decide what is computed, not the window.
 
 #include "observations/kernel/scan_of_robot.h"
 

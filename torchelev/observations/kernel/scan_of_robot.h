@@ -1,4 +1,4 @@
-// One robot's height scan at a time: scan_reading.py.
+// One robot's height scan at a time: scan/reading.py.
 #pragma once
 
 #include <algorithm>
@@ -12,11 +12,11 @@
 
 namespace scans {
 
-enum Fill : int32_t { NONE, GROUND, LOWEST, UPPER_BOUND, INPAINT };  // of scan_kernel.py
+enum Fill : int32_t { NONE, GROUND, LOWEST, UPPER_BOUND, INPAINT };  // of scan/kernel.py
 
 constexpr int64_t FEW = 4096;  // points, which one thread reads before another one wakes up
 
-// As `Scan` of scan_kernel.py.
+// As `Scan` of scan/kernel.py.
 struct Scan {
     const double *pose, *feet;  // (B, 4, 4); (B, K, 3), null around the base
     const int64_t* corner;      // (B, 2)

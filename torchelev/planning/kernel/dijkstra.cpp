@@ -1,4 +1,4 @@
-// The cost to go by Dijkstra's algorithm, and the descent along it: planning/dijkstra.py.
+// The cost to go by Dijkstra's algorithm, and the descent along it: planning/solvers/dijkstra.py.
 
 #include <functional>
 #include <queue>

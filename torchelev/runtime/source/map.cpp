@@ -10,15 +10,6 @@
 
 namespace {
 
-// In the order of `Layer`.
-const char* const LAYERS[] = {"elevation", "variance", "validity", "time",    "upper_bound", "traversability",
-                              "normal_x",  "normal_y", "normal_z", "ceiling", "clearance"};
-
-// The layers that a map has.
-std::vector<std::string> layers_of(const Config& cfg) {
-    return {std::begin(LAYERS), cfg.has_levels() ? std::end(LAYERS) : LAYERS + CEILING};
-}
-
 constexpr torchelev_limits USUAL{131072, 4, 1};
 
 torchelev_limits checked_limits(const torchelev_limits* given) {
@@ -43,17 +34,6 @@ void fill_tensor(const Tensor& tensor, void* to, int64_t count) {
     if (dtype == "F32") return fill<float>(to, count, tensor.blank);
     if (dtype == "I64") return fill<int64_t>(to, count, tensor.blank);
     fill<uint8_t>(to, count, tensor.blank);
-}
-
-// What the position's covariance adds to a height's variance: `pose_variance` of layers.py.
-float pose_variance(const float* C, float gx, float gy) {
-    const float level = C[0] * (gx * gx) + 2 * C[1] * gx * gy + C[4] * (gy * gy);
-    return std::max(level + C[8] - 2 * (C[2] * gx + C[5] * gy), 0.0f);
-}
-
-float normal_component(float gx, float gy, int axis) {
-    const float component[] = {-gx, -gy, 1};
-    return component[axis] / std::sqrt(1 + gx * gx + gy * gy);
 }
 
 }  // namespace
@@ -162,43 +142,6 @@ void torchelev_map::check(const torchelev_input& input) const {
             "give the seconds since the last update");
 }
 
-namespace {
-
-// Whether a symmetric matrix (6, 6), to which `least` is added on its diagonal, has no negative eigenvalue: its
-// Cholesky factorisation exists.
-bool is_semidefinite(const double* matrix, double least) {
-    double L[6][6] = {};
-    for (int i = 0; i < 6; i++)
-        for (int j = 0; j <= i; j++) {
-            double rest = matrix[6 * i + j] + (i == j ? least : 0);
-            for (int k = 0; k < j; k++) rest -= L[i][k] * L[j][k];
-            if (i == j && rest < 0) return false;
-            L[i][j] = i == j ? std::sqrt(rest) : L[j][j] > 0 ? rest / L[j][j] : 0;
-        }
-    return true;
-}
-
-void require_covariances(const double* values, int64_t number) {
-    const char* name = "pose_covariance";
-    double scale = 0;
-    for (int64_t k = 0; k < 36 * number; k++) {
-        REQUIRE(std::isfinite(values[k]), name, "must be finite", "NaN or inf",
-                "where the pose's uncertainty is unknown, leave it out");
-        scale = std::max(scale, std::fabs(values[k]));
-    }
-    for (int64_t s = 0; s < number; s++) {
-        const double* matrix = values + 36 * s;
-        for (int i = 0; i < 6; i++)
-            for (int j = 0; j < i; j++)
-                REQUIRE(std::fabs(matrix[6 * i + j] - matrix[6 * j + i]) <= 1e-4 * scale, name, "must be symmetric",
-                        "another", "give the covariance of x, y, z and the rotations about the map's axes");
-        REQUIRE(is_semidefinite(matrix, 1e-4 * scale), name, "must have no negative eigenvalue", "one",
-                "give the covariance of x, y, z and the rotations about the map's axes");
-    }
-}
-
-}  // namespace
-
 void torchelev_map::update(const torchelev_input& input) {
     check(input);
     if (input.pose_covariance) require_covariances(input.pose_covariance, input.num_sensors);
@@ -274,64 +217,6 @@ void torchelev_map::run(const torchelev_input& input, const Stage* stages, int64
 void torchelev_map::run_update(const torchelev_input& input) {
     if (levels) run(input, ORDER_WITH_LEVELS, std::size(ORDER_WITH_LEVELS));
     else run(input, ORDER, std::size(ORDER));
-}
-
-// Reading ------------------------------------------------------------------------------------------------------------
-
-LayerView torchelev_map::view(const std::string& name) const {
-    const char* const* const last = levels ? std::end(LAYERS) : LAYERS + CEILING;
-    const auto own = [&](const std::string& layer) {
-        return LayerView{*this, Layer(std::find(std::begin(LAYERS), last, layer) - LAYERS), nullptr};
-    };
-    if (const LayerView found = own(name); LAYERS + found.layer < last) return found;
-    REQUIRE(filters.has(name), "layer", "must be one of " + joined(layers_of(cfg)) + filters.listed(),
-            "'" + name + "'", "use elevation");
-    const std::lock_guard<std::mutex> lock(filtering);
-    const Cells& made = filters.read(name, [&](const std::string& layer, Cells& to) {
-        for (int64_t k = 0; k < cells(); k++) {
-            const CellValue cell = own(layer).at(k);
-            to.values[k] = cell.known ? cell.value : 0, to.known[k] = cell.known;
-        }
-    });
-    return {*this, ELEVATION, &made};
-}
-
-CellValue LayerView::at(int64_t cell) const {
-    return made ? CellValue{made->values[cell], made->known[cell] != 0} : map.read(layer, cell);
-}
-
-void torchelev_map::require_grid(int64_t height, int64_t width, double side, const char* reader) const {
-    const bool fits = height == sizes.H && width == sizes.W && side == resolution();
-    REQUIRE(fits, "map", std::string("must have the grid that the ") + reader + " was created for", "another",
-            std::string("create one for this map"));
-}
-
-CellValue torchelev_map::read(Layer layer, int64_t k) const {
-    const MapState& s = state;
-    const float gx = s.gradient_x[k], gy = s.gradient_y[k];
-    const bool known = s.validity[k];
-    switch (layer) {
-        case ELEVATION:
-            return {s.elevation[k], known};
-        case VARIANCE:
-            return {s.variance[k] + pose_variance(s.pose_covariance, gx, gy), known};
-        case VALIDITY:
-            return {float(known), true};
-        case TIME:
-            return {s.time[k], known};
-        case UPPER_BOUND:
-            return {known ? s.elevation[k] : s.upper_bound[k], known || s.bounded[k]};
-        case TRAVERSABILITY:
-            return {s.traversability[k], known && s.rated[k]};
-        case CEILING:
-        case CLEARANCE: {
-            const Ceiling found = levels->ceiling(s, k);
-            if (layer == CEILING) return {found.height, found.known};
-            return {found.height - s.elevation[k], found.known && known};
-        }
-        default:
-            return {normal_component(gx, gy, layer - NORMAL_X), known && s.has_normal[k]};
-    }
 }
 
 // For tests, which compare them with Python's.

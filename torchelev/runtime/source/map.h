@@ -27,6 +27,8 @@ struct CellValue {
 
 struct torchelev_map;
 
+std::vector<std::string> layers_of(const Config& cfg);  // of a map with these settings
+
 // A layer as it is read, cell by cell.
 struct LayerView {
     const torchelev_map& map;
@@ -87,6 +89,8 @@ struct torchelev_map {
 
 // Refuse matrices (number, 4, 4) that are not given or not rigid, as `check_pose` does.
 void require_poses(const char* name, const double* poses, int64_t number);
+// Refuse matrices (number, 6, 6) that are no covariances, as `require_covariance` does.
+void require_covariances(const double* values, int64_t number);
 
 // A saved map: state_file.cpp.
 void save_state(const torchelev_map& map, const std::string& path);

@@ -1,4 +1,4 @@
-// Checks of poses: inputs/checks.py, with its sentences.
+// Checks of poses and their covariances: inputs/checks.py, with its sentences.
 #include <algorithm>
 
 #include "runtime/source/map.h"
@@ -51,9 +51,42 @@ void require_pose(const char* name, const double* T) {
             "check its units and source");
 }
 
+// Whether a symmetric matrix (6, 6), to which `least` is added on its diagonal, has no negative eigenvalue: its
+// Cholesky factorisation exists.
+bool is_semidefinite(const double* matrix, double least) {
+    double L[6][6] = {};
+    for (int i = 0; i < 6; i++)
+        for (int j = 0; j <= i; j++) {
+            double rest = matrix[6 * i + j] + (i == j ? least : 0);
+            for (int k = 0; k < j; k++) rest -= L[i][k] * L[j][k];
+            if (i == j && rest < 0) return false;
+            L[i][j] = i == j ? std::sqrt(rest) : L[j][j] > 0 ? rest / L[j][j] : 0;
+        }
+    return true;
+}
+
 }  // namespace
 
 void require_poses(const char* name, const double* poses, int64_t number) {
     REQUIRE(poses, name, "must be given", "null", "give (4, 4) doubles for each");
     for (int64_t k = 0; k < number; k++) require_pose(name, poses + 16 * k);
+}
+
+void require_covariances(const double* values, int64_t number) {
+    const char* name = "pose_covariance";
+    double scale = 0;
+    for (int64_t k = 0; k < 36 * number; k++) {
+        REQUIRE(std::isfinite(values[k]), name, "must be finite", "NaN or inf",
+                "where the pose's uncertainty is unknown, leave it out");
+        scale = std::max(scale, std::fabs(values[k]));
+    }
+    for (int64_t s = 0; s < number; s++) {
+        const double* matrix = values + 36 * s;
+        for (int i = 0; i < 6; i++)
+            for (int j = 0; j < i; j++)
+                REQUIRE(std::fabs(matrix[6 * i + j] - matrix[6 * j + i]) <= 1e-4 * scale, name, "must be symmetric",
+                        "another", "give the covariance of x, y, z and the rotations about the map's axes");
+        REQUIRE(is_semidefinite(matrix, 1e-4 * scale), name, "must have no negative eigenvalue", "one",
+                "give the covariance of x, y, z and the rotations about the map's axes");
+    }
 }

@@ -1,4 +1,4 @@
-// Height scans without Python: height_scan.py, scan_settings.py and scan_layout.py.
+// Height scans without Python: height_scan.py, scan/settings.py and scan_layout.py.
 
 #include "runtime/source/scan.h"
 

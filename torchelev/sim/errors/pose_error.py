@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 class PoseErrorConfig:
     """Errors of estimated poses; each value is a number, or a range (low, high) that every environment draws from.
 
-    Noise is drawn anew at each call. Drift is a random walk: after t seconds and d metres its variance is
+    Noise is drawn at each call. Drift is a random walk: after t seconds and d metres its variance is
     drift_time^2 t + drift_distance^2 d. Roll and pitch have no error, as gravity makes them observable.
 
     A constant bias shifts the map as a whole and leaves a height scan relative to the robot unchanged. Noise changes

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from torchelev.site.content.tiles import TILE, locate_tiles
 from torchelev.site.fusion.exchange import ALONE, Exchange
 from torchelev.site.fusion.windows import Windows
 from torchelev.site.site_config import SiteConfig
-from torchelev.site.tiles import TILE, locate_tiles
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-_NEIGHBORS = 8  # windows of a cell that each window is compared with; the others follow through these
+_NEIGHBORS = 8  # windows of a cell that each window is compared with; it reaches the others through these
 _MAX_PAIRS = 1 << 17
 _BYTES = 16  # of a cell that is sent to the owner of its tile
 
@@ -41,7 +41,7 @@ class Compared(NamedTuple):
     variance: Float[Tensor, "K"]  #: [m^2]
 
     def select(self, chosen: Int[Tensor, "k"]) -> Compared:
-        """Return some of them, by number."""
+        """Return the ones with these numbers."""
         return Compared(*(value.index_select(0, chosen) for value in self))
 
 
@@ -55,7 +55,7 @@ class Pairs(NamedTuple):
     position: Float[Tensor, "4 P"] | None  #: [m] x and y of the cell from the centre of both windows; None: not needed
 
     def select(self, chosen: Int[Tensor, "p"]) -> Pairs:
-        """Return some of them, by number."""
+        """Return the ones with these numbers."""
         position = None if self.position is None else self.position.index_select(1, chosen)
         first, second, difference, variance = (value.index_select(0, chosen) for value in self[:4])
         return Pairs(first, second, difference, variance, position)

@@ -1,4 +1,4 @@
-"""What a merge sends to the processes that share its work: nothing, while there is one."""
+"""What a merge sends to the processes that share its work: nothing if there is only one."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ class Heights(NamedTuple):
         return self.time == self.time  # NaN is not; a third of the time of isfinite
 
     def at(self, cells: Tensor) -> Heights:
-        """Return some of them, by number."""
+        """Return the ones with these numbers."""
         return Heights(*(value.index_select(0, cells) for value in self))
 
     def where(self, mask: Tensor, others: Heights) -> Heights:
@@ -274,7 +274,7 @@ def _sum_contributed(
 def _replaces(
     other: Heights, first: Heights, holds_new: tuple[Tensor, Tensor], rate: float, cfg: SiteConfig
 ) -> Bool[Tensor, "C"]:
-    """Return where the other height is to be the site's: newer and about as sure, or as new and surer.
+    """Return where the other height replaces the site's: newer and about as sure, or as new and surer.
 
     Between equal times, `holds_new` decides: where the first and the other hold what was merged just now.
     """

@@ -10,6 +10,8 @@ from torch import Tensor
 from torchelev.levels.config import LevelsConfig
 from torchelev.levels.state import SURFACE, Levels
 from torchelev.levels.surfaces import SETTLED
+from torchelev.site.content.levels import SPACE
+from torchelev.site.content.tiles import LAYERS, Tiles
 from torchelev.site.fusion.entries import MIN_VARIANCE, fuse_entries, rise
 from torchelev.site.fusion.fuse import Entries, Heights
 from torchelev.site.fusion.join_surfaces import Cells, Surfaces, join, tidy, withdraw
@@ -17,8 +19,6 @@ from torchelev.site.fusion.pieces import Pieces
 from torchelev.site.fusion.stacks import Change, Stack, compare, read_stack, windows_of
 from torchelev.site.fusion.windows import Alignment, Known, Windows
 from torchelev.site.site_config import SiteConfig
-from torchelev.site.site_levels import SPACE
-from torchelev.site.tiles import LAYERS, Tiles
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -173,7 +173,7 @@ def raise_ground(
     rate: float,
     cfg: SiteConfig,
 ) -> Cells:
-    """Make the ground of some cells another surface of theirs, in place; return the cells without it."""
+    """Turn the ground of some cells into one of their other surfaces, in place; return the cells without it."""
     cell = is_raised.nonzero()[:, 0]
     elevation, variance, time = (layers[row][cell] for row in _GROUND)
     nothing = Heights(*[torch.full_like(time, torch.nan)] * 3)

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from torchelev.channels.config import ChannelConfig
+from torchelev.site.content.tiles import Tiles
 from torchelev.site.fusion.pieces import Pieces
 from torchelev.site.fusion.shares import Change, Share
-from torchelev.site.tiles import Tiles
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int

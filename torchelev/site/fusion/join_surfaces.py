@@ -37,7 +37,7 @@ class Surfaces(NamedTuple):
     above: Heights  #: upper faces of the same
 
     def at(self, chosen: Tensor) -> Surfaces:
-        """Return some of them, by number."""
+        """Return the ones with these numbers."""
         below, above = self.below.at(chosen), self.above.at(chosen)
         own = {name: getattr(self, name)[chosen] for name in _OWN}
         return self._replace(below=below, above=above, **own)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchelev.ops.parallel import map_in_order
+from torchelev.site.content.tiles import LAYERS, Tile, Tiles
 from torchelev.site.fusion.entries import fuse_entries, read_offers, rise
 from torchelev.site.fusion.fuse_levels import Robots, fuse_levels
 from torchelev.site.fusion.fuse_shares import fuse_channels
@@ -18,7 +19,6 @@ from torchelev.site.fusion.shares import Change
 from torchelev.site.fusion.stacks import Change as SurfaceChange
 from torchelev.site.fusion.windows import Alignment, Windows
 from torchelev.site.site_config import SiteConfig
-from torchelev.site.tiles import LAYERS, Tile, Tiles
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int

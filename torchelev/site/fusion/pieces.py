@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.site.tiles import CELLS, TILE, Tile, locate_tiles
+from torchelev.site.content.tiles import CELLS, TILE, Tile, locate_tiles
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -114,7 +114,7 @@ def _cut(tiles: list[Tile], robot: Tensor, tile: Tensor, corner: Tensor, size: t
 
 
 def _enumerate(counts: Int[Tensor, "P"]) -> tuple[Tensor, Tensor]:
-    """Return for each of as many items as are counted whose it is, and its number among those."""
+    """Return for each counted item its owner, and its number among that owner's items."""
     whose = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts)
     number = torch.arange(len(whose), device=counts.device)
     return whose, number - (counts.cumsum(0) - counts).index_select(0, whose)

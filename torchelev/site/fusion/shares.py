@@ -1,4 +1,4 @@
-"""What robots know of the channels of a site, and what of it the site has taken."""
+"""What robots know of the channels of a site, and which part of it the site has taken."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
     from torchelev.elevation_map import ElevationMap
-    from torchelev.site.channels import SiteChannels
+    from torchelev.site.content.channels import SiteChannels
 
 
 class Share(NamedTuple):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from torchelev.site.content.tiles import CELLS, TILE, Tile, Tiles
 from torchelev.site.fusion.entries import fuse_entries
 from torchelev.site.fusion.fuse import Entries, Heights
 from torchelev.site.fusion.merge import Merged, lower_bounds
@@ -16,7 +17,6 @@ from torchelev.site.keyframes.keyframe_log import KeyframeLog
 from torchelev.site.keyframes.keyframes import BOUND, CONTRIBUTED, OWN, Recorded, Rows, join
 from torchelev.site.keyframes.moves import Moves, find_footprints, find_moves, look_up
 from torchelev.site.site_config import SiteConfig
-from torchelev.site.tiles import CELLS, TILE, Tile, Tiles
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchelev.io.rasters.raster import Raster
+from torchelev.site.content.tiles import TILE, Tiles
 from torchelev.site.fusion.merge import Merged, merge_windows
 from torchelev.site.fusion.windows import Known, Windows, no_alignment
 from torchelev.site.site_config import SiteConfig
-from torchelev.site.tiles import TILE, Tiles
 
 _BLOCK = 8 * TILE  # cells along x and y that are merged at a time
 
@@ -43,7 +43,7 @@ class Box(NamedTuple):
         return not all(a < b for a, b in zip(self.first, self.end, strict=True))
 
     def blocks(self) -> Iterator[Box]:
-        """Yield parts of it that have no tile in common, from north to south, as most files are read fastest."""
+        """Yield parts of it that have no tile in common, from north to south, the fastest order for most files."""
         x, y = (range(a // _BLOCK, (b - 1) // _BLOCK + 1) for a, b in zip(self.first, self.end, strict=True))
         for b in reversed(y):
             for a in x:

@@ -1,10 +1,9 @@
 """A site as a service: robots publish windows over Zenoh, and one process merges them. Needs ``torchelev[serve]``.
 
-- `merger`: the process that holds the site, `SiteServer`. `ledger` decides which message counts, `served_site` merges.
-- `robot`: `RobotLink` publishes what a map measures. `outbox` keeps it until the site has it, as
-  `snapshots`.
-- `reader`: `SiteReader` reads areas of the site from anywhere.
-- `messages`, `windows_message`: the bytes that travel. `transport` and `serve`: Zenoh. `access`: keys of robots.
+- `server`: the process that holds the site, `SiteServer`. `ledger` decides which message counts.
+- `robot`: `RobotLink` publishes what a map measures. `outbox` keeps it as `snapshots` until the site has it.
+- `reader`: `SiteReader` reads areas of the site from anywhere, by `questions`.
+- `wire`: messages as bytes, keys of robots, and Zenoh.
 
 Fusing is not here, see `torchelev.site.fusion`, nor are processes that share a site, see `torchelev.site.shared`.
 
@@ -16,10 +15,10 @@ known to the robot, from the acknowledgements, and travels with its message: a m
 memory than the site.
 """
 
-from torchelev.site.service.merger import SiteServer
 from torchelev.site.service.outbox import RefusedError
 from torchelev.site.service.reader import SiteReader
 from torchelev.site.service.robot import RobotLink
-from torchelev.site.service.serve import NetworkedServer
+from torchelev.site.service.server.merger import SiteServer
+from torchelev.site.service.server.serve import NetworkedServer
 
 __all__ = ["NetworkedServer", "RefusedError", "RobotLink", "SiteReader", "SiteServer"]

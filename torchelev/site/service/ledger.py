@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from enum import Enum
 from typing import Any, NamedTuple
 
-from torchelev.site.service.messages import take_count, take_text
+from torchelev.site.service.wire.messages import take_count, take_text
 
 TAKEN, SUPERSEDED, OTHER_SITE, LOST = "taken", "superseded", "other_site", "lost"
 
@@ -25,8 +25,8 @@ class Verdict(Enum):
 
     MERGE = "merge"  #: it is the next one
     AGAIN = "again"  #: it has been merged: acknowledge it again
-    DROP = "drop"  #: an older one has come late
-    REFUSE = "refuse"  #: it cannot be merged; the robot must be told why
+    DROP = "drop"  #: an older one that arrived late
+    REFUSE = "refuse"  #: it cannot be merged; the answer gives the reason
 
 
 class Decision(NamedTuple):

@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchelev.errors import require
 from torchelev.site.areas import require_resolution
 from torchelev.site.fusion.merge import MergeReport
-from torchelev.site.fusion.windows import Alignment, Contribution, Windows, drop_reset, move_known
+from torchelev.site.fusion.windows import Contribution, Windows, drop_reset, move_known
 from torchelev.site.service.ledger import OTHER_SITE, TAKEN
-from torchelev.site.service.messages import MessageError, OtherVersionError, decode, encode, take_count, take_text
 from torchelev.site.service.snapshots import Snapshot, find_left, join, make_windows
-from torchelev.site.service.windows_message import layout_of, sizes_of, to_arrays
+from torchelev.site.service.wire.alignment import read_alignment
+from torchelev.site.service.wire.messages import MessageError, OtherVersionError, decode, encode, take_count, take_text
+from torchelev.site.service.wire.windows import layout_of, sizes_of, to_arrays
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Int
@@ -105,7 +105,7 @@ class Outbox:
     # What the robot knows -------------------------------------------------------------------------------------------
 
     def add(self, snapshot: Snapshot) -> None:
-        """Take what the windows know now."""
+        """Add a snapshot of what the windows know now."""
         part = None if self._last is None else find_left(self._last, snapshot)
         if part is not None and part.counts.any():
             if self._latest is not None:
@@ -155,7 +155,7 @@ class Outbox:
         return self._payload
 
     def hurry(self) -> None:
-        """Send what is due at once: a merger has come."""
+        """Send what is due at once, as a merger has appeared."""
         self._due, self._retry = 0.0, _FIRST_RETRY
 
     def _wait_from(self, now: float) -> None:
@@ -200,7 +200,7 @@ class Outbox:
         return self.contribution
 
     def begin_with(self, contribution: Contribution) -> None:
-        """Take what the maps know now as what the site has of them: they were filled from it, and nothing waits."""
+        """Take what the maps know now as their contribution: they were filled from the site, and nothing waits."""
         known, zero = contribution.known, torch.zeros_like(contribution.known.elevation)
         surface = zero, zero, zero.bool(), zero, zero.bool()
         self._last = Snapshot(known, *surface, known.age, contribution.elapsed, contribution.num_resets)
@@ -209,7 +209,7 @@ class Outbox:
     # Answers --------------------------------------------------------------------------------------------------------
 
     def receive(self, payload: bytes, now: float) -> bool:
-        """Take an answer of a merger; return whether it was one. Others are ignored, as are late and repeated ones."""
+        """Handle an answer of a merger; return whether it was one. Late and repeated answers are ignored, too."""
         try:
             message = decode(payload)
             header = message.header
@@ -248,12 +248,12 @@ class Outbox:
         return True
 
     def _land(self, header: Mapping[str, Any], now: float) -> bool:
-        """Take an acknowledgement."""
+        """Handle an acknowledgement."""
         flight = self._flight
         is_own = (header["epoch"], header["number"]) == (self._epoch, self.num_acknowledged + 1)
         if flight is None or not is_own or header["site"] != self._site:
             return False
-        alignment = _alignment(header, len(flight.snapshot.elapsed))
+        alignment = read_alignment(header, len(flight.snapshot.elapsed))
         self.version, self._offset = take_text(header, "version"), alignment.offset
         counts = (torch.tensor(header[name]) for name in ("new_cells", "contradictions"))
         self.report = MergeReport(*alignment, *counts)
@@ -269,7 +269,7 @@ class Outbox:
         return True
 
     def _forget(self, left: _Left) -> None:
-        """Drop cells from the contribution that have left the windows: if they come back, they are measured anew."""
+        """Drop cells from the contribution that have left the windows: if they come back, they are measured again."""
         was = self.contribution
         if was is None:
             return
@@ -290,13 +290,3 @@ class Outbox:
         else:
             self.error = RefusedError(f"robot {self.robot}: {text}")
         return True
-
-
-def _alignment(header: Mapping[str, Any], size: int) -> Alignment:
-    """Return how windows were aligned, as an acknowledgement says."""
-    offset = torch.tensor(header["offset"], dtype=torch.float64)
-    tilt = torch.tensor(header["tilt"], dtype=torch.float64)
-    is_isolated = torch.tensor(header["isolated"], dtype=torch.bool)
-    fits = offset.shape == is_isolated.shape == (size,) and tilt.shape == (size, 2)
-    require(fits, "message", f"must say the offsets of {size} windows", tuple(offset.shape), "is it damaged?")
-    return Alignment(offset, tilt, is_isolated)

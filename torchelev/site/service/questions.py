@@ -1,16 +1,18 @@
-"""Questions about a site: areas of it, for whoever plans, shows or begins there."""
+"""Questions about areas of a site, to plan on, to show or to start from."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchelev.site.service.messages import MAX_ARRAYS, MessageError, decode, encode
-from torchelev.site.service.served_site import ServedSite
+from torchelev.site.service.wire.messages import MAX_ARRAYS, MessageError, decode, encode
+
+if TYPE_CHECKING:
+    from torchelev.site.service.server.served_site import ServedSite
 
 
 class Areas(NamedTuple):
@@ -27,7 +29,7 @@ def ask_areas(corner: Sequence[Sequence[int]], height: int, width: int, layers: 
 
 
 def answer_question(site: ServedSite, payload: bytes) -> bytes:
-    """Return the answer to a question about a site, which may be why there is none."""
+    """Return the answer to a question about a site, or the reason why there is none."""
     try:
         header = decode(payload).header
         corner, size, names = _read(header)
@@ -54,7 +56,7 @@ def describe(site: ServedSite) -> dict[str, Any]:
 
 
 def _read(header: Mapping[str, Any]) -> tuple[list[list[int]], tuple[int, int], list[str]]:
-    """Return corners, size and layers of a question; MessageError if it is none, or one for too much."""
+    """Return corners, size and layers of a question; MessageError if it is not a question, or asks for too much."""
     corner, names, sides = header.get("corner"), header.get("layers"), (header.get("height"), header.get("width"))
     are_cells = isinstance(corner, list) and all(
         isinstance(cell, list) and len(cell) == 2 and all(type(k) is int and abs(k) < 1 << 40 for k in cell)

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 from torchelev.io.export import SavedMap
 from torchelev.site.areas import place_area, save_area
-from torchelev.site.service.access import check_name
-from torchelev.site.service.messages import MessageError, decode
 from torchelev.site.service.questions import Areas, ask_areas, read_answer
-from torchelev.site.service.transport import Channel, open_channel
+from torchelev.site.service.wire.access import check_name
+from torchelev.site.service.wire.messages import MessageError, decode
+from torchelev.site.service.wire.transport import Channel, open_channel
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -21,7 +21,7 @@ HEIGHTS = ("elevation", "variance", "time", "upper_bound")
 
 
 class SiteReader:
-    """Reads areas of a site that a merger serves, and hears of its new versions.
+    """Reads areas of a site that a merger serves, and learns of its new versions.
 
     Args:
         site: name of the site on the network.
@@ -54,7 +54,7 @@ class SiteReader:
         return self._version
 
     def _receive(self, payload: bytes) -> None:
-        """Take what the network delivers."""
+        """Handle what the network delivers."""
         try:
             header = decode(payload).header
         except MessageError:
@@ -69,7 +69,7 @@ class SiteReader:
                 self.on_version(version)
 
     def _on_merger(self) -> None:
-        """A merger has come."""
+        """Called when a merger appears."""
 
     def areas(
         self, corner: Sequence[Sequence[int]], height: int, width: int, layers: Sequence[str], timeout: float = 5.0

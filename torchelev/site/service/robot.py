@@ -9,27 +9,26 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
 from torchelev.maps.centering import center_on
 from torchelev.site.areas import require_resolution
+from torchelev.site.content.reading import Clock
 from torchelev.site.fusion.merge import MergeReport
 from torchelev.site.fusion.windows import Known, no_contribution, read_known
-from torchelev.site.initialize_from_site import add_filled, fill, move_contribution
-from torchelev.site.service.access import check_key, check_name
+from torchelev.site.initialize_from_site import fill_windows, spread
 from torchelev.site.service.outbox import MAX_WAITING, Outbox
 from torchelev.site.service.reader import HEIGHTS, SiteReader
 from torchelev.site.service.snapshots import read_snapshot
-from torchelev.site.service.transport import Channel, open_channel
+from torchelev.site.service.wire.access import check_key, check_name
+from torchelev.site.service.wire.transport import Channel, open_channel
 from torchelev.site.times import check_time
-from torchelev.stages.initialize import Remembered
 from torchelev.state import MapState, map_layers
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
+    from jaxtyping import Bool, Int
 
 _FLUSH = 10.0  # [s] that `initialize_from` waits for what is still to be acknowledged
 _IDLE = 0.25  # [s] between looks at the clock
@@ -217,22 +216,15 @@ class RobotLink(SiteReader):
         state, chosen = map_layers(lambda value: value.index_select(0, envs), whole), chosen[envs]
         ids, (H, W) = chosen.nonzero()[:, 0], state.elevation.shape[1:]
         areas = self.areas(state.corner[ids].tolist(), H, W, HEIGHTS)
-        now, rate, resolution = (float(areas.about[name]) for name in ("time", "rate", "resolution"))
+        clock, resolution = Clock(*(float(areas.about[n]) for n in ("time", "rate"))), float(areas.about["resolution"])
         require_resolution(emap.cfg.grid.resolution, resolution)
-        site = Remembered(*(_spread(areas.layers.get(name), ids, state.elevation) for name in Remembered._fields))
+        site = spread({name: torch.as_tensor(value) for name, value in areas.layers.items()}, ids, state.elevation)
         with self._changed:
             num_resets = emap.num_resets.cpu()[envs]
             was = self._outbox.recall(num_resets, state.elapsed)
             if was is None:
-                known = Known(*(value.index_select(0, envs) for value in read_known(emap, whole, now)))
+                known = Known(*(value.index_select(0, envs) for value in read_known(emap, whole, clock.time)))
                 was = no_contribution(known, num_resets)
-            was = move_contribution(was, state.corner, now, resolution)
-            after = fill(state, emap, site, was, chosen, resolution)
-            self._outbox.begin_with(add_filled(was, state, after, rate, chosen))
-        return after
-
-
-def _spread(values: NDArray | None, ids: Int[Tensor, "K"], like: Float[Tensor, "E H W"]) -> Float[Tensor, "E H W"]:
-    """Return a layer of all environments, NaN of those that were not asked for."""
-    unknown = torch.full(like.shape, torch.nan)
-    return unknown if values is None else unknown.index_copy(0, ids, torch.as_tensor(values))
+            filled = fill_windows(state, emap, site, was, chosen, clock, resolution)
+            self._outbox.begin_with(filled.contribution)
+        return filled.state

@@ -34,11 +34,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchelev.errors import require
-from torchelev.site.channels import SiteChannels
+from torchelev.site.content.channels import SiteChannels
+from torchelev.site.content.levels import SiteLevels
+from torchelev.site.content.tiles import LAYERS, TILE
 from torchelev.site.shared.ranks import Ranks
-from torchelev.site.site_levels import SiteLevels
 from torchelev.site.storage.engines import create_store, exists, open_store
-from torchelev.site.tiles import LAYERS, TILE
 
 if TYPE_CHECKING:
     from torchelev.site.storage.engines import Engine

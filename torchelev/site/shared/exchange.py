@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from torchelev.site.content.tiles import TILE
 from torchelev.site.fusion.exchange import ALONE, Exchange
 from torchelev.site.shared.owners import Owners, share_out
 from torchelev.site.shared.ranks import Ranks
-from torchelev.site.tiles import TILE
 
 if TYPE_CHECKING:
     from jaxtyping import Int, UInt8
@@ -55,7 +55,7 @@ class RankExchange(Exchange):
         return list(messages.split(received)), sum(map(sum, sizes))
 
     def split(self, corner: Int[Tensor, "B 2"], size: Sequence[int]) -> None:
-        """Share out the tiles, so that as many windows have their centre in those of each rank."""
+        """Share out the tiles, so that those of each rank hold the centres of equally many windows."""
         tiles = (corner + torch.tensor(size, device=corner.device) // 2) // TILE
         self._owners = share_out(self.gather(lambda: tiles))
 

@@ -42,7 +42,7 @@ class Owners(NamedTuple):
 
 
 def share_out(windows: Sequence[Int[Tensor, "B 2"]]) -> Owners:
-    """Return owners of as many windows each, of whose own as many as possible.
+    """Return owners of equally many windows, with as many of their own as possible.
 
     Args:
         windows: for each rank, the tiles in which the centres of its windows lie.
@@ -54,7 +54,7 @@ def share_out(windows: Sequence[Int[Tensor, "B 2"]]) -> Owners:
 
 
 def _split(tiles: Int[Tensor, "N 2"], own: Int[Tensor, "N"], size: int, is_exchanged: bool) -> Owners:
-    """Cut the curve into stretches of as many windows; the one with the most windows of a rank is that rank's."""
+    """Cut the curve into stretches of equally many windows; the one with the most windows of a rank is that rank's."""
     number = number_along_curve(*(tiles.flip(1) if is_exchanged else tiles).unbind(1))
     ordered = number.sort().values
     begins = ordered[[len(ordered) * rank // size for rank in range(1, size)]]

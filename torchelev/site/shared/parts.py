@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from torchelev.site.content.tiles import CELLS
 from torchelev.site.fusion.entries import Offers
 from torchelev.site.fusion.fuse import Entries, Heights
 from torchelev.site.fusion.merge import read_bounds
 from torchelev.site.fusion.pieces import Pieces
 from torchelev.site.fusion.windows import Alignment, Windows
 from torchelev.site.shared.messages import Shape
-from torchelev.site.tiles import CELLS
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchelev.ops.parallel import map_in_order
+from torchelev.site.content.tiles import Tile, Tiles
 from torchelev.site.fusion.entries import fuse_entries, read_offers
 from torchelev.site.fusion.exchange import Exchange
 from torchelev.site.fusion.merge import Merged, lower_bounds
@@ -17,7 +18,6 @@ from torchelev.site.fusion.windows import Alignment, Windows
 from torchelev.site.shared.messages import make_messages, read_message
 from torchelev.site.shared.parts import Chosen, OwnPart, SentPart, choose_cells, join_entries
 from torchelev.site.site_config import SiteConfig
-from torchelev.site.tiles import Tile, Tiles
 
 if TYPE_CHECKING:
     from jaxtyping import UInt8

@@ -33,7 +33,7 @@ _CHUNKS = "c"  # folder of an array's chunks
 def check_names(path: Path, names: list[str]) -> None:
     """Raise ValueError unless the names fit a folder: a name with others below it is a group, and no array.
 
-    Looks at what bears these names alone: a site may have very many arrays.
+    Looks at these names only: a site may have very many arrays.
     """
     require_names(names)
     groups = {"/".join(name.split("/")[:depth]): name for name in names for depth in range(1, name.count("/") + 1)}

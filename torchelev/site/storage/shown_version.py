@@ -1,4 +1,4 @@
-"""What both engines' stores show of their version, and the commit of tiles that are there at once."""
+"""What the stores of both engines share: the header of their version, and committing tiles in one call."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class ShownVersion:
-    """The part of a `SiteStore` that its header and its list of tiles tell; also a context, which closes it."""
+    """The part of a `SiteStore` that follows from its header and its list of tiles; as a context, it closes itself."""
 
     _header: Header
     _tiles: frozenset[Tile]

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def side_of_step(
     points: ContestedCells, shown: CellHeights, width: int, relief: float, cfg: EdgeConfig
 ) -> tuple[Tensor, Tensor]:
-    """Keep walls and steps sharp (paper, Sec. II-C): tell which side of a step is the cell's; `fusion` drops the other.
+    """Keep walls and steps sharp (paper, Sec. II-C): choose the cell's side of a step; `fusion` drops the other.
 
     The paper ignores the points below the estimate, so that the top of a wall wins over its face. The top is wrong
     where the wall starts beyond the cell's centre: there, rays passed over the centre and hit low, so the ground is

@@ -33,7 +33,7 @@ def update_all(points: HitPoints, before: CellLayers, grid: GridConfig, cfg: Fus
     """Update all cells; `before` is (B, C) each."""
     scan, prior = gather_points(points, grid, cfg), gather_prior(before)
     consensus = estimate_consensus(scan, prior, grid, cfg)
-    if has_rays:  # nothing else tells outliers in a blind spot from an obstacle
+    if has_rays:  # nothing else distinguishes outliers in a blind spot from an obstacle
         challenge = challenge_from_above(prior, consensus, grid.width, cfg.relief * grid.resolution, cfg)
     else:
         unchanged = prior.challenger.clone(), prior.challenger_support.clone()

@@ -16,9 +16,9 @@ from tqdm import tqdm
 
 from torchelev import ElevationMap
 from torchelev.errors import require
-from torchelev.files.weight_files import RESOLUTIONS
 from torchelev.robot import RobotConfig
 from torchelev.sim import HeightField
+from torchelev.traversability.trained_range import RESOLUTIONS
 from training.fit import save_atomically
 from training.traversability.labels.labels import can_stand
 from training.traversability.maps.mapping import DataConfig, exact_maps, tile_cell_centers, walk_and_map

@@ -4,7 +4,7 @@ import pytest
 
 from benchmarks.speed.run import timings
 from benchmarks.speed.update import plots, tables
-from docs.readme_tables import SPEED, load
+from docs.results import SPEED, load
 
 
 @pytest.mark.slow(2)

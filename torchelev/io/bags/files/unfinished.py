@@ -1,6 +1,6 @@
 """Bags without an index, as after a crash or a full disk: read from the start to the last whole record.
 
-Records are read by rosbags (ROS 1), mcap and sqlite3. MCAP files that are closed and hold no index are read so, too.
+Records are read by rosbags (ROS 1), mcap and sqlite3. Closed MCAP files without an index are read in this way, too.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from torchelev.io.bags.messages.cloud import CloudError, Note
 
-_DISTORTED = 1e-3  # largest coefficient of a lens that is taken as without distortion
+_DISTORTED = 1e-3  # largest coefficient of a lens that counts as free of distortion
 _FISHEYE = ("equidistant", "fisheye")
 _NUM_COEFFICIENTS = (4, 5, 8, 12, 14)
 _MODELS = ("", "plumb_bob", "rational_polynomial", *_FISHEYE)
@@ -26,7 +26,7 @@ class Lens(NamedTuple):
 
 
 def choose_lens(camera: Any, topic: str = "") -> tuple[Lens, Note | None]:
-    """Return how an image was projected: rectified, with the matrix of P, or as it came, with K and D.
+    """Return the projection of an image: that of P if it is rectified, else that of K with the distortion D.
 
     Images are taken as rectified if their topic has "rect" in its name, or the lens has no distortion. Some drivers
     fill in only one of the matrices.
@@ -98,7 +98,7 @@ def _lens(matrix: NDArray[np.float64]) -> Lens:
 
 
 def _numbers(camera: Any, name: str, num: int) -> NDArray[np.float64]:
-    """Return an array of ROS 1 or ROS 2, which write it large and small; zeros where it is missing."""
+    """Return an array by its name, in capitals in ROS 1 and lower case in ROS 2; zeros where it is missing."""
     values = np.asarray(getattr(camera, name.upper(), getattr(camera, name, ())), dtype=np.float64).ravel()
     return values if len(values) == num or not num else np.zeros(num)
 

@@ -15,7 +15,7 @@ class CloudError(ValueError):
 
     Args:
         text: what is wrong, with the numbers of this message.
-        kind: the same for all messages of which the same is wrong; "": the text.
+        kind: shared by all messages with the same problem; "": the text.
     """
 
     def __init__(self, text: str, kind: str = "") -> None:

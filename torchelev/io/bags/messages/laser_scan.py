@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from torchelev.io.bags.messages.cloud import Cloud, Note
-from torchelev.io.point_times import longest_scan
+from torchelev.io.points.times import longest_scan
 
 _SMALLER = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # units in which drivers give a time_increment that ROS wants in s
 _SHORTEST = 0.1  # of a period: how long a scan in such a unit takes at least

@@ -9,7 +9,7 @@ import numpy as np
 from torchelev.io.bags.messages.cloud import Cloud
 
 LIVOX = tuple(f"{package}/msg/CustomMsg" for package in ("livox_ros_driver2", "livox_ros_driver", "livox_interfaces"))
-_NEAR = 2.0  # [s] by which `timebase` may lie beside the stamp
+_NEAR = 2.0  # [s] by which `timebase` may differ from the stamp
 
 
 def read_livox(message: Any, stamp: float) -> Cloud:

@@ -153,7 +153,7 @@ class SettingWatch:
         self.notes: list[str] = []
 
     def is_set(self, topic: str, stamp: float, recorded: float) -> bool:
-        """Return whether a scan has a stamp of another clock; poses may arrive late, and ever later."""
+        """Return whether a scan has a stamp of another clock; poses may arrive with a growing delay."""
         ahead = self._clock.measure(stamp, recorded) if self._clock.has_started(recorded) else None
         if ahead is None:
             self._early |= {topic} - self._last.keys()

@@ -66,7 +66,7 @@ def metadata_of(attributes: Mapping[str, Any], note: Note, key: str = "") -> dic
     Args:
         attributes: of the site, kept as text: Icechunk sorts the names of what it keeps as values.
         note: what the history says of it.
-        key: tells apart commits that a lost connection left in doubt.
+        key: identifies the commit if a lost connection leaves it in doubt.
     """
     text = encode_json(attributes)
     return {"attributes": text, "robots": note.num_robots, "cells": note.num_cells, "commit": key}

@@ -1,0 +1,1 @@
+"""`torchelev bag`: what a bag holds, and the command that maps it."""

@@ -1,0 +1,63 @@
+"""`torchelev view`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from torchelev.app.commands.map import map_command
+from torchelev.app.mapping.map_request import MapRequest
+from torchelev.app.option_groups import GroupedCommand, GroupedOption
+
+_VIEW_HELP = """Show a map in the browser while it grows.
+
+RECORDING is a folder of scans or a bag, as of `torchelev map`, with the same
+options; or a map that was saved, .npz. Without it, a simulated walk is shown.
+
+\b
+  torchelev view                   the demo's walk
+  torchelev view drive.mcap        a bag
+  torchelev view drive/            a folder of scans with poses
+  torchelev view map.npz           a saved map
+
+The page plays the recording, pauses, steps and goes back. It colours the
+surface by any layer, shows cloud, frames, path and planes, and the values of
+the cell that is clicked. Ctrl-C closes it.
+"""
+
+
+def _run_view(recording: Path | None, host: str, port: int, paused: bool, **options: Any) -> None:
+    """Run `torchelev view`; its help text is `_VIEW_HELP`."""
+    from torchelev.app.view_command import run_view
+
+    request = None if recording is None else MapRequest(recording=recording, **options)
+    run_view(request, host, port, paused)
+
+
+_OUTPUTS = ("recording", "out", "grid_map", "video", "every")  # parameters of `map` that `view` lacks
+_PAGE = "Page"
+_VIEW_OPTIONS: list[click.Parameter] = [
+    click.Argument(["recording"], type=click.Path(path_type=Path), required=False),
+    GroupedOption(
+        ["--host"],
+        group=_PAGE,
+        default="127.0.0.1",
+        show_default=True,
+        help="Address of the page; 0.0.0.0 lets other machines connect.",
+    ),
+    GroupedOption(
+        ["--port"],
+        group=_PAGE,
+        type=click.IntRange(1, 65535),
+        default=8080,
+        show_default=True,
+        help="Port of the page.",
+    ),
+    GroupedOption(["--paused"], group=_PAGE, is_flag=True, help="Wait at the first scan."),
+    *(parameter for parameter in map_command.params if parameter.name not in _OUTPUTS),
+]
+view_command = GroupedCommand(
+    "view", params=_VIEW_OPTIONS, callback=_run_view, help=_VIEW_HELP, short_help="Show a map in the browser."
+)

@@ -1,0 +1,1 @@
+"""What points carry besides their position: times within a scan, and colours."""

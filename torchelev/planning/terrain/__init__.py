@@ -1,0 +1,1 @@
+"""What planning reads of a map around a robot: the ground below its footprint, ceilings, inclination."""

@@ -1,0 +1,1 @@
+"""The process that holds a site: it takes messages, decides which count, merges them and answers."""
