@@ -23,7 +23,7 @@ T_CAMERA, T_LIDAR = mount(pitch_deg=35.0), mount(pitch_deg=0.0)
 HELD_OUT = 0.3  # share of a real scan's points
 REAL_RESOLUTION, REAL_SIDE, REAL_RANGE = 0.1, 20.0, 20.0  # [m]
 FEWEST = 200  # cells of a real recording whose ground is known
-AGREE = 0.1  # [m] most that the held-out points of a cell may differ
+AGREE = 0.1  # [m] most that the points of a cell may differ
 NEAR = 0.05  # [m] of the truth, within which a point says that its cell was seen
 
 
@@ -127,12 +127,17 @@ def real(folder: Path) -> Iterator[Recording]:
             frames.append(Frame(points[keep], pose, pose, DT))
             held.append(Frame(points[~keep], pose, pose, DT))
         x, y = frames[0].T_map_sensor[:2, 3]
-        low = (float(x) - REAL_SIDE / 2, float(y) - REAL_SIDE / 2)
+        low = (_on_lattice(x - REAL_SIDE / 2), _on_lattice(y - REAL_SIDE / 2))
         height = _height_over_ground(frames[0])
         setup = Setup(REAL_RESOLUTION, low, (round(REAL_SIDE / REAL_RESOLUTION),) * 2, REAL_RANGE, height, None)
         truth, seen = _held_out(setup, held, frames)
         if np.isfinite(truth(0)).sum() >= FEWEST:
             yield Recording(path.name, setup, frames, truth, seen)
+
+
+def _on_lattice(value: float) -> float:
+    """Return the nearest border of cells [m], so that cells are those of maps on the same lattice."""
+    return float(round(value / REAL_RESOLUTION) * REAL_RESOLUTION)
 
 
 def _height_over_ground(frame: Frame) -> float:
@@ -145,7 +150,8 @@ def _height_over_ground(frame: Frame) -> float:
 def _held_out(setup: Setup, held: list[Frame], frames: list[Frame]) -> tuple[Callable[[int], Array], Array]:
     """Return the median of the held-out points of each cell, and the cells of the other points.
 
-    NaN where there are fewer than three, or where they disagree: below trees and at walls no height is the true one.
+    NaN where there are fewer than three, or where the points of the cell disagree, the others included: below trees and
+    at walls no height is the true one, also if all held-out points hit the leaves.
     """
     cells = Cells(setup)
     number, points = cells.number(np.concatenate([frame.placed() for frame in held]))
@@ -153,9 +159,18 @@ def _held_out(setup: Setup, held: list[Frame], frames: list[Frame]) -> tuple[Cal
     number, z = number[order], points[order, 2]
     first, count = np.unique(number, return_index=True, return_counts=True)[1:]
     truth = np.full(len(cells.sum), np.nan)
-    agree = (count >= 3) & (z[first + count - 1] - z[first] <= AGREE)
-    truth[number[first]] = np.where(agree, z[first + count // 2], np.nan)
+    truth[number[first]] = np.where(count >= 3, z[first + count // 2], np.nan)
+    truth[_range(cells, held + frames) > AGREE] = np.nan
     for frame in frames:
         cells.add(frame.placed())
     truth = truth.reshape(setup.cells)
     return (lambda scan: truth), (cells.count > 0).reshape(setup.cells)
+
+
+def _range(cells: Cells, frames: list[Frame]) -> Array:
+    """Return highest less lowest point of each cell [m]."""
+    number, points = cells.number(np.concatenate([frame.placed() for frame in frames]))
+    high, low = np.full(len(cells.sum), -np.inf), np.full(len(cells.sum), np.inf)
+    np.maximum.at(high, number, points[:, 2])
+    np.minimum.at(low, number, points[:, 2])
+    return high - low

@@ -86,8 +86,9 @@ def scan_height(cell, points, relief, shown, *, gate, max_gate_std, edges):
     side = margin = 0
     if edges is not None:
         margin = edges["margin"]
-        far = sum(not agrees(p, guess, gate_variance, relief, gate) for p in points)
-        if len(points) >= edges["min_points"] and far >= edges["min_share"] * len(points):
+        sigma2 = [p["variance"] + relief**2 + gate_variance for p in points]
+        misfit = sum(min(1.0, (p["z"] - guess) ** 2 / (gate**2 * s)) for p, s in zip(points, sigma2, strict=True))
+        if len(points) >= edges["min_points"] and misfit >= edges["min_share"] * len(points):
             side, guess = side_of_step(points, edges, relief, shown)
     wrong = [side * (p["z"] - guess) < -margin * math.sqrt(p["variance"] + relief**2) for p in points]
     kept = [p for p, w in zip(points, wrong, strict=True) if not w and agrees(p, guess, gate_variance, relief, gate)]

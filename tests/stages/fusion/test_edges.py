@@ -94,10 +94,20 @@ def test_a_wall_without_a_cell_behind_it_stays():
 
 def test_a_cell_marked_as_a_step_has_a_side():
     """Although all its points lie within the gate around their robust mean."""
-    z = [0.0] * 6 + [0.025] * 4
+    z = [0.0] * 6 + [0.02] * 4
     height, side = one_cell(z, [1.0] * 10, step=0)
-    assert 0 < height < 0.0125 and side == 0
-    assert one_cell(z, [1.0] * 10, step=1) == pytest.approx([0.025, 1.0])
+    assert 0 < height < 0.01 and side == 0
+    assert one_cell(z, [1.0] * 10, step=1) == pytest.approx([0.02, 1.0])
+
+
+def test_a_face_is_a_step_although_no_point_lies_outside_the_gate():
+    """The standard deviation is 1 cm, the gate 3 cm: an even spread over 5.8 cm is more than noise explains."""
+    even = torch.linspace(0, 0.058, 12).tolist()
+    height, side = one_cell(even, [1.0] * 12)
+    assert side == 1 and 0.048 < height <= 0.058
+    noise = (0.01 * torch.linspace(0.04, 0.96, 12).mul(2).sub(1).erfinv() * 2**0.5).tolist()
+    height, side = one_cell(noise, [1.0] * 12)
+    assert side == 0 and abs(height) < 1e-3
 
 
 def test_points_that_are_not_used_hide_no_step():

@@ -11,15 +11,15 @@ namespace fusion {
 // Compare the points of a cell with its elevation: `estimate_consensus` and `compare_with_prior`.
 template <class Points, class V = typename Points::V>
 INLINE Consensus<V> estimate_consensus(const Points& points, const Prior<V>& prior, const FusionSettings& s) {
-    V agreeing{}, weight{}, moment{}, shared{};
+    V agreeing{}, misfit{}, weight{}, moment{}, shared{};
     const V gate_at = gate_variance(prior.variance, s);
     points.each([&](const Point<V>& q) {
         agreeing += number_if<V>(agrees(q, prior.elevation, gate_at, s));
-        weight += q.weight, moment += q.weight * q.z, shared += q.weight * q.shared;
+        misfit += misfit_of(q, prior.elevation, gate_at, s), weight += q.weight, moment += q.weight * q.z, shared += q.weight * q.shared;
     });
-    points.add_up(agreeing, weight, moment, shared);
+    points.add_up(agreeing, misfit, weight, moment, shared);
     const Flag<V> trusted = trust_majority(points.number, agreeing, prior.known);
-    const Flag<V> is_step = trusted & has_step(points.number, points.number - agreeing, s);
+    const Flag<V> is_step = trusted & has_step(points.number, misfit, s);
     return {points.number, ratio(moment, weight), variance_of_mean(weight, shared, s), trusted, is_step};
 }
 
@@ -49,13 +49,10 @@ template <class V> struct Resolved {
 template <class Points, class V = typename Points::V>
 INLINE Resolved<V> resolve_contested(const Points& points, const Consensus<V>& consensus, const FusionSettings& s) {
     const V settled = robust_mean(points, consensus.mean);
-    V far{};
-    points.each([&](const Point<V>& q) {
-        const V residual = q.z - consensus.mean - settled;
-        far += number_if<V>(q.used & (square(residual) > square(s.gate) * q.spread));
-    });
-    points.add_up(far);
-    return {consensus.mean + settled, Flag<V>(consensus.is_step | has_step(points.number, far, s))};
+    V misfit{};
+    points.each([&](const Point<V>& q) { misfit += misfit_of(q, consensus.mean + settled, splat<V>(0), s); });
+    points.add_up(misfit);
+    return {consensus.mean + settled, Flag<V>(consensus.is_step | has_step(points.number, misfit, s))};
 }
 
 // The height [m] that counts in a cell, as far as it holds no step, and whether it does: `estimate_consensus`. A single

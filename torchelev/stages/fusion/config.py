@@ -15,10 +15,11 @@ MAX_REFINEMENTS = 100  # after some thirty, float32 has no digits left
 
 @dataclass(frozen=True, kw_only=True)
 class EdgeConfig:
-    """When a cell counts as a step: many points, and many of them far from the cell's estimate."""
+    """When a cell counts as a step: many points, whose heights differ by more than their noise explains."""
 
     min_points: int = 6  #: minimum number of points in a cell with a step
-    min_share: float = 0.25  #: minimum share of the cell's points outside the gate
+    #: minimum mean misfit of the cell's points: their squared distance from its height in units of the gate, at most 1
+    min_share: float = 0.25
     min_passed: float = 0.1  #: share of the low points that must pass the centre for the ground to win over the top
     min_extreme: int = 2  #: minimum number of points within a standard deviation of the top or bottom
     refinements: int = 7  #: iterations; each halves the distance to the top of a wall
@@ -34,9 +35,9 @@ class EdgeConfig:
         require(self.margin >= 0, "fusion.edges.margin", "must not be negative", self.margin, "give 0.25")
         require(self.min_share > 0, "fusion.edges.min_share", "must be positive", self.min_share, "give 0.25")
 
-    def has_step(self, number: Tensor, far: Tensor) -> Tensor:
-        """Return which cells hold a step, by the number of their points and of those far from the estimate."""
-        return (number >= self.min_points) & (far >= self.min_share * number)
+    def has_step(self, number: Tensor, misfit: Tensor) -> Tensor:
+        """Return which cells hold a step, by the number of their points and the sum of their misfits."""
+        return (number >= self.min_points) & (misfit >= self.min_share * number)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,7 @@ from torchelev.ops.indexing import SelectedCells
 from torchelev.stages.fusion.config import EdgeConfig, FusionConfig
 from torchelev.stages.fusion.contested import NO_HEIGHT, CellHeights, ContestedCells, ratio
 from torchelev.stages.fusion.edges import side_of_step
-from torchelev.stages.fusion.points import Prior, ScanPoints, agrees, gate_variance
+from torchelev.stages.fusion.points import Prior, ScanPoints, agrees, gate_variance, misfit
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -53,9 +53,8 @@ def resolve_contested(
     settled, side = robust_mean(points), torch.zeros_like(points.mean)
     if edges is not None:
         residual = points.z - points.at_points(settled)
-        near = points.used * (residual.square() <= gate**2 * points.spread)
-        number, close = points.sum(torch.stack([points.used, near])).unbind(0)
-        step = edges.has_step(number, number - close) | points.has_step
+        columns = torch.stack([points.used, points.used * misfit(residual, points.spread, gate)])
+        step = edges.has_step(*points.sum(columns).unbind(0)) | points.has_step
         if points.any_true(step):
             which, end = side_of_step(points, shown, width, relief, edges)
             settled, side = torch.where(step, end, settled), torch.where(step, which, side)
@@ -78,13 +77,14 @@ class Consensus(NamedTuple):
 
 def estimate_consensus(scan: ScanPoints, prior: Prior, grid: GridConfig, cfg: FusionConfig) -> Consensus:
     """Trust a cell's elevation where most points agree with it, else the robust mean, and at a step one of its ends."""
-    near, gate_at = compare_with_prior(scan, prior, cfg)
-    number, agreeing, weight, moment = scan.sums(scan.used, near, scan.weight, scan.weight * scan.z)
+    near, misfits, gate_at = compare_with_prior(scan, prior, cfg)
+    columns = scan.used, near, misfits, scan.weight, scan.weight * scan.z
+    number, agreeing, total_misfit, weight, moment = scan.sums(*columns)
     number, trusted = trust_majority(number, agreeing, prior.known)
     mean = ratio(moment, weight).detach()
     has_step = torch.zeros_like(trusted)
     if cfg.edges is not None:
-        has_step = trusted & cfg.edges.has_step(number, number - agreeing)
+        has_step = trusted & cfg.edges.has_step(number, total_misfit)
     elevation = prior.elevation.detach()
     shown = CellHeights(torch.where(number > 0, mean, NO_HEIGHT), torch.where(prior.known, elevation, NO_HEIGHT))
     # A single point is its cell's robust mean, and most cells of a sparse scan have one.
@@ -97,11 +97,12 @@ def estimate_consensus(scan: ScanPoints, prior: Prior, grid: GridConfig, cfg: Fu
     return Consensus(height, side, trusted, number, variance, near, gate_at, SelectedCells(is_challenged))
 
 
-def compare_with_prior(scan: ScanPoints, prior: Prior, cfg: FusionConfig) -> tuple[Tensor, Tensor]:
-    """Return which points agree with their cell's elevation, and the variance [m^2] by which it widens the gate."""
+def compare_with_prior(scan: ScanPoints, prior: Prior, cfg: FusionConfig) -> tuple[Tensor, Tensor, Tensor]:
+    """Return which points agree with their cell's elevation, their misfits, and the variance [m^2] of its gate."""
     elevation_at, variance_at = scan.cells.take(prior.elevation, prior.variance)
     gate_at = gate_variance(variance_at, cfg)
-    return agrees(scan, elevation_at, gate_at, cfg), gate_at
+    misfits = scan.used * misfit(scan.z - elevation_at, scan.spread + gate_at, cfg.gate)
+    return agrees(scan, elevation_at, gate_at, cfg), misfits, gate_at
 
 
 def trust_majority(number: Tensor, agreeing: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:

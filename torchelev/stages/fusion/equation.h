@@ -67,9 +67,15 @@ template <class V> INLINE Flag<V> trust_majority(V number, V agreeing, Flag<V> k
     return known & (2 * agreeing >= number);
 }
 
-// Whether a cell holds a step, by the number of its points and of those far from the estimate: `EdgeConfig.has_step`.
-template <class V> INLINE Flag<V> has_step(V number, V far, const FusionSettings& s) {
-    return (number >= (s.has_edges ? float(s.min_points) : 3e38f)) & (far >= s.min_share * number);
+// How badly a point fits a height: `misfit`.
+template <class V> INLINE V misfit_of(const Point<V>& q, V height, V variance, const FusionSettings& s) {
+    const V distance = square(q.z - height) / (square(s.gate) * (q.spread + variance));
+    return pick(q.used, smaller(distance, splat<V>(1)), splat<V>(0));
+}
+
+// Whether a cell holds a step, by the number of its points and the sum of their misfits: `EdgeConfig.has_step`.
+template <class V> INLINE Flag<V> has_step(V number, V misfit, const FusionSettings& s) {
+    return (number >= (s.has_edges ? float(s.min_points) : 3e38f)) & (misfit >= s.min_share * number);
 }
 
 // The weight of a point of which the mean is `residual` [m] away: `reduced_mean`.

@@ -123,6 +123,14 @@ def gate_variance(variance: Tensor, cfg: FusionConfig) -> Tensor:
     return variance.clamp(max=cfg.max_gate_std**2).detach()
 
 
+def misfit(residual: Tensor, variance: Tensor, gate: float) -> Tensor:
+    """Return how badly points fit a height: min(1, (z - h)^2 / (gate^2 sigma^2)), without a gradient.
+
+    The heights on a wall's face differ by more than noise explains also where none lies outside the gate.
+    """
+    return (residual.square() / (gate**2 * variance)).clamp(max=1.0).detach()
+
+
 def agrees(scan: ScanPoints, height: Tensor, variance: Tensor, cfg: FusionConfig) -> Tensor:
     """Return which points lie in the gate: |z - h| <= gate * sqrt(sigma_h^2 + sigma_p^2), a Mahalanobis distance."""
     return scan.used & ((scan.z - height).square() <= cfg.gate**2 * (scan.spread + variance))
