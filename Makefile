@@ -16,7 +16,7 @@ NEWTON := .venv-newton
 GENESIS := .venv-genesis
 PEERS := .venv-peers
 
-.PHONY: help wheel demo test test-fast test-library test-mjlab test-mujoco train-mjlab test-isaaclab bench-isaaclab test-newton test-genesis test-ros2 test-ros2-torch bench-ros2 matrix lint types setup bench quality quality-em-cupy quality-levels quality-odometry train-ceilings peers runtime docs clean
+.PHONY: help wheel test-wheel demo test test-fast test-library test-mjlab test-mujoco train-mjlab test-isaaclab bench-isaaclab test-newton test-genesis test-ros2 test-ros2-torch bench-ros2 matrix lint types setup bench quality quality-em-cupy quality-levels quality-odometry train-ceilings peers runtime docs clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 12
@@ -168,6 +168,20 @@ test-library: setup
 wheel: setup  ## build a wheel that carries the C++ libraries, for processors of this kind
 	$(BIN)/python -m torchelev.app.build_ahead
 	$(BIN)/python -m hatchling build -t wheel
+
+# As a user installs it: no checkout in the way, and the packages that pip chooses.
+test-wheel: wheel  ## install the wheel on Python 3.10 to 3.13, where they are, and run the demo; 5 GB for each
+	@for version in 3.10 3.11 3.12 3.13; do \
+		for python in python$$version $$(ls -d $${PYENV_ROOT:-$$HOME/.pyenv}/versions/$$version.*/bin/python 2>/dev/null); do \
+			$$python -c '' 2>/dev/null || continue; \
+			place=$$(mktemp -d) && $$python -m venv $$place/venv && \
+			$$place/venv/bin/python -m pip install --quiet --disable-pip-version-check "$$(ls $(CURDIR)/dist/*.whl)[io]" && \
+			(cd $$place && venv/bin/torchelev demo --out demo.png && ls -l demo.png && venv/bin/python -c \
+				"import torch, torchelev; print('Python $$version, torch', torch.__version__, torchelev.ElevationMap().backend)") \
+				|| exit 1; \
+			rm -rf $$place; break; \
+		done; \
+	done
 
 lint: setup  ## check style, and that imports go downwards
 	$(BIN)/ruff check --no-cache .

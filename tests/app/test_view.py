@@ -70,6 +70,10 @@ def test_without_a_recording_the_demo_walks(run, port, shown):
     "args, words",
     [
         (("nowhere",), "nowhere: no such file or folder"),
+        (
+            ("map.png",),
+            "map.png: is of no kind that can be shown; give a bag (.bag, .mcap, .db3), a folder of scans or",
+        ),
         (("drive", "--extrinsics", "1 2"), "12 numbers"),
         (("broken.npz",), "broken.npz"),
         (("drive", "--port", "0"), "0 is not in the range"),
@@ -80,6 +84,7 @@ def test_without_a_recording_the_demo_walks(run, port, shown):
 )
 def test_bad_input_is_one_line(run, recording, shown, tmp_path, args, words):
     (tmp_path / "broken.npz").write_bytes(b"PK but no more")
+    (tmp_path / "map.png").write_bytes(b"")
     export.save_npz(tmp_path / "whole.npz", mapped(num_envs=1))
     code, _, err = run("view", *args)
     assert code == 2 and words in err and "Traceback" not in err and not shown

@@ -15,7 +15,7 @@ from torchelev.app.mapping.fuse_scans import fuse_all, new_map
 from torchelev.app.mapping.map_request import MapRequest
 from torchelev.app.mapping.open_scans import open_scans
 from torchelev.app.user_error import user_errors
-from torchelev.io import Frame, MappingRun
+from torchelev.io import Frame, MappingRun, is_bag
 
 if TYPE_CHECKING:
     from torchelev.channels.config import ChannelConfig
@@ -50,6 +50,9 @@ def run_view(request: MapRequest | None, host: str, port: int, is_paused: bool) 
             elif request.recording.suffix == ".npz" and request.recording.is_file():
                 _refuse_options(request)
                 _view_map(make_page, request.recording)
+            elif request.recording.is_file() and not is_bag(request.recording):
+                kinds = "a bag (.bag, .mcap, .db3), a folder of scans or a saved map (.npz)"
+                raise ValueError(f"{request.recording}: is of no kind that can be shown; give {kinds}")
             else:
                 _view_recording(make_page, request, is_paused)
         except KeyboardInterrupt:

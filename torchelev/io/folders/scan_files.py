@@ -33,7 +33,8 @@ def find_scans(folder: Path, depth: bool = False) -> list[Path]:
         RecordingError: there are no scans, several folders or formats of them, or files that cannot be read.
     """
     if not folder.is_dir():
-        problem = "is a file, not a folder" if folder.exists() else "no such file or folder"
+        problem = "is neither a folder of scans nor a bag (.bag, .mcap, .db3)"
+        problem = problem if folder.exists() else "no such file or folder"
         raise RecordingError(folder, problem, "give the folder that holds the scans")
     for place in _list_places(folder, depth):
         files = [path for path in place.iterdir() if _is_input(path)]
