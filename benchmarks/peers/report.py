@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from torchelev.app.results import markdown_table
-from torchelev.viz.style import make_figure, save, styled
+from torchelev.viz.style import make_figure, styled, write
 
 Scores = dict[str, dict[str, dict[str, Any]]]  # by recording and peer
 CAMERA, LIDAR = "depth camera", "lidar"
@@ -142,4 +142,4 @@ def draw(path: Path, result: dict[str, Any]) -> None:
     ax.margins(y=0.15)
     ax.set_ylim(bottom=0)
     figure.legend(loc="outside right center")
-    save(figure, path)
+    write(figure, path)

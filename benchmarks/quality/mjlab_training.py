@@ -26,7 +26,7 @@ import torch
 from benchmarks import RESULTS
 from benchmarks.quality import mjlab_task
 from torchelev.app.results import machine, markdown_table, write_json
-from torchelev.viz.style import make_figure, save, styled
+from torchelev.viz.style import make_figure, styled, write
 
 SCANS = {"ideal": "ideal scan", "map": "map of the depth camera"}
 FOLDER = Path("runs/mjlab_training")
@@ -145,7 +145,7 @@ def plot(result: dict[str, Any], path: Path) -> Any:
         axes.set(xlabel="iteration", title=title)
         if place == 0:
             axes.legend(loc="lower right")
-    save(figure, path)
+    write(figure, path)
     return figure
 
 

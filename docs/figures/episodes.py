@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from envs.terrain_nav import TerrainNav
 from envs.terrain_nav.outcome import ENDINGS
 from envs.terrain_nav.render import Snapshot, draw_column, snapshot, window_around
-from torchelev.viz.style import ROBOT_COLOR, make_figure, save, styled
+from torchelev.viz.style import ROBOT_COLOR, make_figure, styled, write
 from training.nav.evaluate import Policy
 from training.nav.train import task_config
 
@@ -89,7 +89,7 @@ def draw(results: tuple[Outcomes, Outcomes], env: int, out: Path) -> None:
     axes[0, 0].set_ylabel("ground\ny [m]")
     axes[1, 0].set_ylabel("the robot's map at the end\ny [m]")
     figure.colorbar(image, ax=axes, pad=0.01, extend="both").set_label("height above the level ground [m]")
-    save(figure, out)
+    write(figure, out)
 
 
 def _trail(result: Outcomes, env: int) -> NDArray:

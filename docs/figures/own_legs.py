@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from benchmarks.self_filter.robot import Scan, make_body, make_cameras, walk
 from torchelev import BodyConfig, ElevationMap, ElevationMapConfig, GridConfig, RobotBody, SensorConfig
-from torchelev.viz.style import HEIGHTS, draw_cells, make_figure, save, styled
+from torchelev.viz.style import HEIGHTS, draw_cells, make_figure, styled, write
 
 PICTURES = Path(__file__).parents[1] / "pictures"
 GRID = GridConfig(resolution=0.02, length_x=1.4, length_y=1.0)
@@ -57,7 +57,7 @@ def draw(out: Path, scans: int = 12) -> None:
         ax.set_xlabel("x [m]")
     axes[0].set_ylabel("y [m]")
     figure.colorbar(image, ax=axes, pad=0.01, extend="max").set_label("elevation [m]")
-    save(figure, out)
+    write(figure, out)
 
 
 @click.command(help=__doc__)

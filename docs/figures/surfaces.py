@@ -25,7 +25,7 @@ from docs.moving_picture.walk import GRID, make_ground, walk
 from docs.moving_picture.walk import Path as RobotPath
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig
 from torchelev.io.poses import read_poses
-from torchelev.viz.style import DEVIATIONS, HEIGHTS, draw_cells, make_figure, save, styled
+from torchelev.viz.style import DEVIATIONS, HEIGHTS, draw_cells, make_figure, styled, write
 
 PICTURES = Path(__file__).parents[1] / "pictures"
 _SIZE = (1500, 900)  # [pixels]
@@ -65,7 +65,7 @@ def draw_uncertainty(out: Path, seconds: float = 6.4) -> None:
     figure = make_figure(8, 4.4)
     picture = render(mesh, DEVIATIONS, limits, ((1.6, -6.6, 5.6), (0.2, 0.0, 0.0)))
     _add_surface(figure.subplots(), picture, DEVIATIONS, limits, "standard deviation [mm]")
-    save(figure, out)
+    write(figure, out)
 
 
 @styled()
@@ -99,7 +99,7 @@ def draw_real_scan(scan: Path, pose: NDArray, driven: NDArray | None, out: Path)
         figure.legend(loc="outside lower right")
     right.set(xlabel="x [m]", ylabel="y [m]", xlim=extent[:2], ylim=extent[2:])
     figure.colorbar(image, ax=right, pad=0.02, extend="both").set_label("height over the median [m]")
-    save(figure, out)
+    write(figure, out)
 
 
 def map_scan(scan: Path, pose: NDArray) -> ElevationMap:

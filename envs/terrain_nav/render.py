@@ -16,7 +16,7 @@ from matplotlib.patches import Polygon
 from envs.terrain_nav.config import TerrainNavConfig
 from envs.terrain_nav.robot import contacts
 from envs.terrain_nav.task import TerrainNav
-from torchelev.viz.style import GOAL_COLOR, HEIGHTS, ROBOT_COLOR, draw_cells, make_figure, save, styled
+from torchelev.viz.style import GOAL_COLOR, HEIGHTS, ROBOT_COLOR, draw_cells, make_figure, styled, write
 
 _CONTRAST = 0.6  # [m] above and below the level ground that the colours span
 _LOW_COLOR, _HIGH_COLOR = "tab:red", "tab:green"  # of boxes that the robot does not fit under, and of those it does
@@ -106,7 +106,7 @@ def save_strip(shots: Sequence[Snapshot], path: Path, *, trail: Sequence[np.ndar
     for ax, name in zip(axes[:, 0], ("ground", "the robot's map"), strict=True):
         ax.set_ylabel(f"{name}\ny [m]")
     figure.colorbar(image, ax=axes, pad=0.01, extend="both").set_label("height above the level ground [m]")
-    save(figure, path)
+    write(figure, path)
 
 
 def window_around(places: np.ndarray, margin: float = 1.2) -> tuple[float, float, float, float]:

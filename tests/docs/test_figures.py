@@ -27,7 +27,7 @@ def test_a_scan_in_kitti_layout_is_mapped_and_drawn(tmp_path):
     elevation = surfaces.map_scan(tmp_path / "000000.bin", poses[0]).layer("elevation")[0]
     assert elevation.isfinite().sum() > 500 and abs(float(elevation.nanmedian())) < 0.02
     surfaces.draw_real_scan(tmp_path / "000000.bin", poses[0], poses[:, :3, 3], tmp_path / "scan.png")
-    assert (tmp_path / "scan.png").stat().st_size > 20_000 and (tmp_path / "scan.svg").exists()
+    assert (tmp_path / "scan.png").stat().st_size > 20_000
 
 
 def test_the_first_episode_is_chosen_that_one_policy_fails_and_the_other_masters():

@@ -100,17 +100,6 @@ def draw_cells(
     return ax.imshow(values.T, extent=extent, cmap=cmap, vmin=vmin, vmax=vmax, origin="lower", interpolation="nearest")
 
 
-def save(figure: Figure, path: str | Path) -> None:
-    """Write a figure as a small PNG, and as an SVG beside it.
-
-    Args:
-        figure: from `make_figure`, drawn within `styled`.
-        path: of the PNG.
-    """
-    for suffix in (".png", ".svg"):
-        write(figure, Path(path).with_suffix(suffix))
-
-
 def require_picture(path: str | Path) -> None:
     """Raise ValueError unless `write` knows the format that the ending of `path` names."""
     known, suffix = sorted(Figure().canvas.get_supported_filetypes()), Path(path).suffix

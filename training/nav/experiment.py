@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from envs.terrain_nav.config import PERCEPTION
 from torchelev.app.results import markdown_table, write_json
-from torchelev.viz.style import make_figure, save, styled
+from torchelev.viz.style import make_figure, styled, write
 from training import RESULTS
 from training.jobs import Job, train_all
 from training.nav.evaluate import evaluate, straight_line
@@ -98,7 +98,7 @@ def plot(result: dict[str, Any], path: Path) -> None:
     right.text(-0.3, result["straight_line"]["success"] - 0.06, "a straight line")
     right.set(title="on the robot's map, held-out ground", ylim=(0, 1), xlim=(-0.4, 2.4), xlabel="trained with")
     right.set_xticks(range(3), ["map", "truth", "nothing"])
-    save(figure, path)
+    write(figure, path)
 
 
 @click.command(help=__doc__)

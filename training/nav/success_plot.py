@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from torchelev.viz.style import make_figure, save, styled
+from torchelev.viz.style import make_figure, styled, write
 
 
 @styled()
@@ -32,4 +32,4 @@ def draw_success(result: dict[str, Any], key: str, names: Mapping[str, str], tit
     left.xaxis.set_major_formatter(lambda steps, _: f"{steps / 1e3:,.0f}k")
     right.set(title="on held-out ground", ylim=(0, 1), xlim=(-0.4, len(values) - 0.6), xlabel=title)
     right.set_xticks(range(len(values)), list(names.values()))
-    save(figure, path)
+    write(figure, path)

@@ -27,7 +27,7 @@ from envs.quadruped.config import PERCEPTION
 from torchelev.app.results import markdown_table, write_json
 from torchelev.errors import require
 from torchelev.sim import make_terrain
-from torchelev.viz.style import make_figure, save, styled
+from torchelev.viz.style import make_figure, styled, write
 from training import RESULTS
 from training.jobs import Job, train_all
 from training.options import jobs_option, runs_option
@@ -225,7 +225,7 @@ def plot(result: dict[str, Any], path: Path) -> Figure:
             axes.set_xticks(levels, [f"{height:.0f}" for height in stair_heights(result["config"])])
             axes.set_xlabel("height of a stair [cm]")
         axes.set_ylabel(f"crossed, of {_per_point(result)}" if place % 3 == 0 else "")
-    save(figure, path)
+    write(figure, path)
     return figure
 
 

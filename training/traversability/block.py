@@ -26,7 +26,7 @@ from torchelev import (
 )
 from torchelev.app.results import markdown_table, write_json
 from torchelev.sim import HeightField
-from torchelev.viz.style import make_figure, save, styled
+from torchelev.viz.style import make_figure, styled, write
 from training import RESULTS
 from training.traversability.labels.labels import can_stand
 
@@ -110,7 +110,7 @@ def draw(profiles: list[dict[str, Any]], path: Path) -> None:
     axes[0].set_ylabel("traversability [0 to 1]")
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
-    save(figure, path)
+    write(figure, path)
 
 
 @click.command(help=__doc__)

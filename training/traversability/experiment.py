@@ -58,8 +58,7 @@ def main(runs: Path, jobs: int, robot: str | None, paper_weights: Path | None) -
     result = evaluate(nets, runs / "data", EVALUATION_BATCHES, cfg, paper_weights)
     fixed = {"seeds": SEEDS, "batches": BATCHES, "exact_batches": EXACT_BATCHES, "steps": STEPS}
     write_json(RESULTS / "traversability.json", result | {"training": fixed})
-    for suffix in (".png", ".svg"):
-        shutil.copy(_folder(runs, SEEDS[0]) / f"maps{suffix}", RESULTS / f"traversability{suffix}")
+    shutil.copy(_folder(runs, SEEDS[0]) / "maps.png", RESULTS / "traversability.png")
     for split in SPLITS:
         click.echo(f"\n{split}\n\n{table(result, split)}")
 

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchelev.traversability.net import TraversabilityNet
-from torchelev.viz.style import HEIGHTS, RATINGS, draw_cells, make_figure, save, styled
+from torchelev.viz.style import HEIGHTS, RATINGS, draw_cells, make_figure, styled, write
 from training import RESULTS
 from training.options import paper_weights_option
 from training.traversability.heads import Score, baselines
@@ -69,7 +69,7 @@ def _draw(rows: dict[str, Layers], sources: dict[str, tuple[MappedTerrain, int]]
     for ax, name in zip(axes[0], next(iter(rows.values())), strict=True):
         ax.set_title(name)
     _draw_color_bars(figure, axes, images)
-    save(figure, path)
+    write(figure, path)
 
 
 def _draw_color_bars(figure: Figure, axes: Any, images: list[Any]) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from benchmarks.quality.accuracy.score import Score, meets
 from torchelev.app.results import markdown_table
-from torchelev.viz.style import make_figure, save, styled
+from torchelev.viz.style import make_figure, styled, write
 
 _MOTIONS = {"turn": "camera, turning", "walk": "camera, walking", "lidar": "lidar"}
 
@@ -49,4 +49,4 @@ def plot(path: Path, rows: list[Score]) -> None:
         panel.grid(axis="x")
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=2)
-    save(figure, path)
+    write(figure, path)

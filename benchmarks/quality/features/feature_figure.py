@@ -13,7 +13,7 @@ from torch import Tensor
 
 from benchmarks.quality.features.comparison import Outcome
 from benchmarks.quality.features.reading import GRID, Figures
-from torchelev.viz.style import HEIGHTS, ROBOT_COLOR, draw_cells, make_figure, save, styled
+from torchelev.viz.style import HEIGHTS, ROBOT_COLOR, draw_cells, make_figure, styled, write
 
 
 class Row(NamedTuple):
@@ -48,7 +48,7 @@ def draw(outcomes: list[Outcome], path: Path) -> None:
         _draw_row(figure, row, outcome, ROWS[outcome.feature.name])
     for ax in axes[-1]:
         ax.set_xlabel("x [m]")
-    save(figure, path)
+    write(figure, path)
 
 
 def _draw_row(figure: Figure, axes: Any, outcome: Outcome, row: Row) -> None:

@@ -16,7 +16,7 @@ from benchmarks.quality.occlusion.walks import GRID
 from torchelev import ElevationMap
 from torchelev.planning.planner import Path
 from torchelev.planning.traversal_cost import traversal_cost
-from torchelev.viz.style import ROBOT_COLOR, draw_cells, make_figure, save, styled
+from torchelev.viz.style import ROBOT_COLOR, draw_cells, make_figure, styled, write
 
 _SPAN = (-1.7, 2.6)  # [m] drawn range of x
 EYE = 0.8  # [m] height of the camera
@@ -37,7 +37,7 @@ def draw(out: str | File, scenes: Sequence[Scene]) -> None:
     axes[1, 0].set_ylabel("y [m]")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
-    save(figure, out)
+    write(figure, out)
 
 
 def _section(ax: Axes, case: Case, emap: ElevationMap, x: float, plans: dict[str, Path]) -> None:

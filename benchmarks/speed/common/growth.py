@@ -10,7 +10,7 @@ from typing import Any
 from matplotlib.ticker import MaxNLocator
 
 from torchelev.app.results import markdown_table
-from torchelev.viz.style import make_figure, save, styled
+from torchelev.viz.style import make_figure, styled, write
 
 GROWTH = 1.05  # largest ratio of the last quarter to the first, and of the old process to a new one
 
@@ -69,4 +69,4 @@ def plot(result: dict[str, Any], path: Path) -> None:
         memory.set_ylim(0, 1.3e-6 * max(values["resident_bytes"]))
     handles = [*ax.lines, *memory.lines]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
-    save(figure, path)
+    write(figure, path)

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, NullFormatter, NullLocator, ScalarFormatter
 
 from benchmarks.speed.common.workload import SENSORS
-from torchelev.viz.style import make_figure, save, styled
+from torchelev.viz.style import make_figure, styled, write
 
 Panel = Callable[[Axes, dict[str, Any]], None]
 
@@ -35,7 +35,7 @@ def _draw_figure(result: dict[str, Any], panels: dict[str, Panel], path: Path) -
         ax.grid()
     machine = result["machine"]
     figure.suptitle(f"{machine['processor']}, {machine['threads']} threads, torch {machine['torch']}", fontsize=10)
-    save(figure, path)
+    write(figure, path)
 
 
 def _draw_points(ax: Axes, result: dict[str, Any]) -> None:

@@ -26,7 +26,7 @@ def test_one_section_into_a_new_folder(tmp_path, capsys):
     options = ["rays", "--out", str(tmp_path), "--seconds", "0.001", "--threads", "1"]
     assert run.main(options, {"rays": lambda seconds: scaling.rays(seconds, small)}) == 0
     assert "growth with ray length" in capsys.readouterr().out
-    assert {path.suffix for path in tmp_path.iterdir()} == {".json", ".png", ".svg"}
+    assert {path.suffix for path in tmp_path.iterdir()} == {".json", ".png"}
 
 
 @pytest.mark.slow(12)

@@ -53,7 +53,7 @@ def test_the_table_has_the_mean_and_the_extremes():
 @pytest.mark.slow(1)
 def test_the_figure_is_drawn(tmp_path):
     experiment.plot(result(), tmp_path / "ceilings.png")
-    assert (tmp_path / "ceilings.png").stat().st_size > 5000 and (tmp_path / "ceilings.svg").exists()
+    assert (tmp_path / "ceilings.png").stat().st_size > 5000
 
 
 @pytest.mark.slow(1)

@@ -53,7 +53,7 @@ def test_the_table_has_the_mean_and_the_extremes():
 @pytest.mark.slow(1)
 def test_the_figure_is_drawn(tmp_path):
     experiment.plot(result(), tmp_path / "encoders.png")
-    assert (tmp_path / "encoders.png").stat().st_size > 5000 and (tmp_path / "encoders.svg").exists()
+    assert (tmp_path / "encoders.png").stat().st_size > 5000
 
 
 def test_reads_every_policy_from_its_folder(tmp_path):
