@@ -187,6 +187,7 @@ lint: setup  ## check style, and that imports go downwards
 	$(BIN)/ruff check --no-cache .
 	$(BIN)/ruff format --check --quiet .
 	$(BIN)/lint-imports
+	@! git grep -nE '^(<{7}|>{7})( |$$)' || { echo 'a merge has left its markers there'; exit 1; }
 
 types: setup  ## check types
 	$(BIN)/mypy

@@ -76,6 +76,7 @@ MISTAKES = {
     "give T_map_base, which the window follows": lambda p, T, base: (p, T + shift(0, 50.0), None),
     "check T_map_base": lambda p, T, base: (p, T, base + shift(0, 50.0)),
     "the sensor moves by": lambda p, T, base: (p, T, torch.linalg.inv(base)),
+    "is the identity": lambda p, T, base: (move(T, p), torch.eye(4, dtype=torch.float64)[None], base),
     "m against the base": lambda p, T, base: (p, T, torch.eye(4, dtype=torch.float64)[None]),
 }
 

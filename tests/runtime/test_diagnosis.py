@@ -30,6 +30,7 @@ MISTAKES = {
     "are in the map frame already": (lambda p, T, base: (in_map(p, FAR @ T), FAR @ T, FAR @ base), {}, DT),
     "such as a national grid": (lambda p, T, base: (in_map(p, FAR), T, base), {}, DT),
     "the sensor moves by": (lambda p, T, base: (p, T, torch.linalg.inv(base)), {}, DT),
+    "is the identity": (lambda p, T, base: (in_map(p, T), torch.eye(4, dtype=torch.float64), base), {}, DT),
     "NaN or infinite": (lambda p, T, base: (p * torch.nan, T, base), {}, DT),
     "sensor.min_distance": (None, {"sensor": {"min_distance": 30.0}}, DT),
     "sensor.exclusion": (None, {"sensor": {"exclusion": {"offset": -9.0, "height": -8.0}}}, DT),

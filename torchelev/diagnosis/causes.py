@@ -72,6 +72,19 @@ def _find_wrong_poses(seen: Evidence) -> str | None:
     return f"poses: {'; or '.join(mistakes)} (as given, {numbers}; without the mistake, ground and scans fit)"
 
 
+def _find_missing_pose(seen: Evidence) -> str | None:
+    """Find sensor poses that were left out, as of points that are in the map frame already."""
+    bases = np.array([base[:3, 3] for base in seen.bases if base is not None]).reshape(-1, 3)
+    bases = bases[np.isfinite(bases).all(1)]
+    moved = float(np.ptp(bases, axis=0).max()) if len(bases) else 0.0
+    if moved < 0.5 or not all(np.array_equal(poses[0], np.eye(4)) for poses in seen.poses):
+        return None
+    return (
+        f"T_map_sensor: it is the identity in all updates, while the base moves by {moved:.1f} m; give the sensor's "
+        "pose, and points in its own frame: their rays start there"
+    )
+
+
 def _find_wrong_base(seen: Evidence) -> str | None:
     """Find a sensor that moves against the base it is mounted on; sensors that take turns return to their mounts."""
     pairs = [(base, poses[0]) for base, poses in zip(seen.bases, seen.poses, strict=True) if base is not None]
@@ -202,6 +215,7 @@ _RULES = (
     _find_far_cloud,
     find_shared_range,
     find_points_on_path,
+    _find_missing_pose,
     _find_wrong_poses,
     _find_wrong_base,
     find_sensor_bias,

@@ -44,7 +44,8 @@ _SENTENCES = {
     Reason.GOAL_OUTSIDE: "the goal is outside the window or not finite; give a goal inside the window",
     Reason.GOAL_UNKNOWN: "the traversability at the goal is unknown and its upper bound is steep or unknown, "
     "or the goal is too close to impassable ground; give a goal on ground that was measured",
-    Reason.GOAL_IMPASSABLE: "the ground at the goal is rated impassable, or is too close to impassable ground",
+    Reason.GOAL_IMPASSABLE: "the ground at the goal is rated impassable, or is too close to impassable ground "
+    "or to unknown cells that may be a step",
     Reason.START_UNKNOWN: "no ground around the robot is passable, and some of it is unknown; "
     "measure it, or initialize the map around the feet",
     Reason.START_IMPASSABLE: "all ground around the robot is rated impassable",

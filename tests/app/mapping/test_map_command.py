@@ -52,6 +52,16 @@ def test_fixed_window_keeps_its_place(run, recording, tmp_path):
 
 
 @pytest.mark.slow(2)
+def test_many_points_above_the_ramp_are_noted(run, recording):
+    assert "exclusion ramp" not in run("map", recording, "--size", 4)[1]
+    for path in (recording / "scans").iterdir():
+        cloud = np.fromfile(path, np.float32).reshape(-1, 4)
+        np.concatenate([cloud, cloud + np.float32([0, 0, 5, 0])]).tofile(path)
+    assert "note      50 % of the points lie above the exclusion ramp" in run("map", recording, "--size", 4)[1]
+    assert "exclusion ramp" not in run("map", recording, "--size", 4, "--levels", 3)[1]
+
+
+@pytest.mark.slow(2)
 def test_robot_height_switches_overlap_clearance_on(run, recording, tmp_path):
     assert run("map", recording, "--size", 8)[0] == 0
     assert load_npz(tmp_path / "map.npz").config["overlap"] is None

@@ -39,7 +39,7 @@ def map_scans(request: MapRequest, scans: Scans, options: MapOptions) -> int:
     recorder = MapRecorder(request.grid_map, _DEFAULT_EVERY if every is None else every, frame)
     stopped = _fuse_and_record(run, scans, options, recorder, video)
     if recorder.num:
-        click.echo(f"recorded  {recorder.num} maps in {recorder.path}")
+        click.echo(f"recorded  {recorder.num} map{'s' * (recorder.num != 1)} in {recorder.path}")
     if video.num:
         click.echo(f"filmed    {video.num} frames in {video.path}")
     return _finish(run, len(scans), prefix, stopped, options)

@@ -48,6 +48,21 @@ std::string find_far_cloud(const Evidence& seen) {
            "give its pose in that frame, and sensor-frame points: subtract its position in float64";
 }
 
+// Sensor poses that were left out, as of points that are in the map frame already.
+std::string find_missing_pose(const Evidence& seen) {
+    double low[] = {INFINITY, INFINITY, INFINITY}, high[] = {-INFINITY, -INFINITY, -INFINITY}, moved = 0;
+    for (const PastUpdate* past : seen.updates) {
+        for (int k = 0; k < 16; k++)
+            if (past->pose(0)[k] != (k % 5 == 0 ? 1.0 : 0.0)) return "";
+        for (int k = 0; past->has_base && k < 3; k++)
+            low[k] = std::min(low[k], past->base[4 * k + 3]), high[k] = std::max(high[k], past->base[4 * k + 3]);
+    }
+    for (int k = 0; k < 3; k++) moved = std::max(moved, high[k] - low[k]);
+    if (moved < 0.5) return "";
+    return "T_map_sensor: it is the identity in all updates, while the base moves by " + fixed(moved, 1) +
+           " m; give the sensor's pose, and points in its own frame: their rays start there";
+}
+
 // A sensor that moves against the base it is mounted on; sensors that take turns return to their mounts.
 std::string find_wrong_base(const Evidence& seen) {
     std::vector<Place> mounts;
@@ -216,8 +231,8 @@ std::string diagnose(torchelev_map& map) {
     if (map.history.all().empty()) return "";
     const Evidence seen(map);
     std::string all;
-    for (const auto rule : {find_millimetres, find_far_cloud, find_wrong_base, find_alternating_corrections,
-                            find_closed_gate, find_window_off_points, find_clearing, find_contradictions,
+    for (const auto rule : {find_millimetres, find_far_cloud, find_missing_pose, find_wrong_base,
+                            find_alternating_corrections, find_closed_gate, find_window_off_points, find_clearing, find_contradictions,
                             find_wrong_dt}) {
         const std::string sentence = rule(seen);
         if (!sentence.empty()) all += sentence + "\n";
