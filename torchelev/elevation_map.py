@@ -172,13 +172,14 @@ class ElevationMap(RestartableMap):
 
     def _run_stages(self, state: MapState, inputs: Inputs, weights: Weights | None) -> None:
         """Update these maps by the backend that suits them."""
-        name = self.backend.name
-        if self.levels is None or name == "CPU":
-            return self._run_backend(
-                name, state, inputs, weights, None if self.levels is None else self.levels.compiled
-            )
-        self._run_backend(name, state, self.levels.sort_points(state, inputs), weights)
-        self.levels.follow_drift(state)
+        name, levels = self.backend.name, self.levels
+        if levels is None:
+            self._run_backend(name, state, inputs, weights)
+        elif name == "CPU":
+            self._run_backend(name, state, inputs, weights, levels.compiled)
+        else:
+            self._run_backend(name, state, levels.sort_points(state, inputs), weights)
+            levels.follow_drift(state)
 
     def _run_backend(
         self, name: str, state: MapState, inputs: Inputs, weights: Weights | None, levels: StoredLevels | None = None
@@ -278,7 +279,8 @@ class ElevationMap(RestartableMap):
     @property
     def backend(self) -> Backend:
         """What runs `update`, and why it is not a faster backend."""
-        return choose(self.elevation, self._key, self._only_by_tensors)
+        why_tensors = self._only_by_tensors or ("" if self.levels is None else self.levels.why_tensors)
+        return choose(self.elevation, self._key, why_tensors)
 
     def compile(self) -> str:  # type: ignore[override]
         """Build what `update` runs on, so that the first one does not; return in a sentence what that is.

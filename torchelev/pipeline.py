@@ -80,9 +80,14 @@ STAGES = (
 #: The names of all steps of an update, as the compiled backends run them.
 ORDER = ("measure", *(stage.name for stage in STAGES))
 
-#: The same of maps with levels, which take their points out of a scan before any other stage reads it, and follow the
-#: drift of the ground: `functional.forward` of levels, by tensors.
-ORDER_WITH_LEVELS = ("measure", "recenter", "sort_levels", *(n for n in ORDER[1:] if n != "recenter"), "raise_levels")
+#: What maps with levels do instead of a step: their points leave the scan before any other step reads it, and they rise
+#: with the ground. By tensors, `functional.forward` of levels has the order.
+_WITH_LEVELS = {
+    "measure": ("measure", "recenter", "sort_levels"),
+    "recenter": (),
+    "compensate": ("compensate", "raise_levels"),
+}
+ORDER_WITH_LEVELS = tuple(step for name in ORDER for step in _WITH_LEVELS.get(name, (name,)))
 
 
 def forward(state: MapState, m: Measurement, cfg: ElevationMapConfig, weights: Weights | None = None) -> MapState:

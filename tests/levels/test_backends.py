@@ -83,3 +83,24 @@ def test_a_pose_that_is_not_finite_changes_nothing(update):
     with pytest.raises(ValueError):
         emap.update(points, T_map_sensor * torch.nan, T_map_base, dt=0.1)
     assert all(torch.equal(value, getattr(emap.levels, name)) for name, value in before.items())
+
+
+def test_levels_that_are_not_contiguous_are_updated_by_tensors():
+    plain, moved = make_map(), make_map().to(memory_format=torch.channels_last)
+    assert plain.backend.name == "CPU" and "the levels are not contiguous" in moved.backend.reason
+    for k in range(2):
+        given = look(covered_scenes.table(), 0.3 * k, 0.0, seed=k)
+        for emap in (plain, moved):
+            emap.update(*given, dt=0.1)
+    require_equal(plain, moved)
+
+
+def test_a_sensor_may_be_far_from_the_window():
+    emap = make_map()
+    points, T_map_sensor, T_map_base = look(covered_scenes.table(), 0.3, 0.0)
+    away = torch.eye(4, dtype=torch.float64)
+    away[0, 3] = 5e8
+    emap.update(points, away @ T_map_sensor, T_map_base, dt=0.1)
+    assert not (emap.levels.support > 0).any()
+    emap.update(points, T_map_sensor, T_map_base, dt=0.1)
+    assert (emap.levels.support > 0).any()

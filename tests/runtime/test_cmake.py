@@ -107,6 +107,16 @@ def test_surfaces_that_were_met_before_allocate_nothing(installed, tmp_path, thr
     assert found == "none\n"
 
 
+def test_maps_with_levels_allocate_nothing_wherever_the_sensors_are(installed, tmp_path):
+    file, cfg, rng = io.BytesIO(), te.ElevationMapConfig(levels=te.LevelsConfig()), np.random.default_rng(0)
+    for x, num_sensors in ((0.1, 1), (0.3, 2), (1.0, 1), (4.0, 2)):
+        T = np.eye(4)[None].repeat(num_sensors, 0)
+        T[:, :3, 3] = x, 0.0, 0.5
+        points = np.dstack([rng.uniform(-2, 2, (num_sensors, 2000, 2)), np.full((num_sensors, 2000), -0.5)])
+        write_instant(file, points.astype(np.float32), T, np.eye(4), 0.2)
+    assert count_allocations(installed, tmp_path, cfg, 10_000, 1, file.getvalue()) == "none\n"
+
+
 def count_allocations(installed, tmp_path, cfg, max_points, threads, instants, free_instants=0):
     """Return what allocations.cpp prints; the first instants may allocate, and are forgotten."""
     config = tmp_path / "map.json"

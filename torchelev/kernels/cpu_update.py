@@ -90,9 +90,8 @@ class CpuUpdate:
         functions = self._addresses(self._order if stages is None else tuple(stages))
         arguments = addresses(state), addresses(inputs), addresses(levels) if levels else None, self._settings, sizes
         references = (None if value is None else ctypes.byref(value) for value in arguments)
-        torch.autograd.graph.increment_version(
-            [*state, *levels]
-        )  # a backward pass through what the maps held shall say so
+        # A backward pass through what the maps held shall say so.
+        torch.autograd.graph.increment_version([*state, *levels])
         call(self.library.update_maps, *references, functions, ctypes.c_int64(len(functions)), torch.get_num_threads())
 
     def _addresses(self, stages: tuple[str, ...]) -> Any:

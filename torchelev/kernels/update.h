@@ -88,7 +88,6 @@ struct Update {
     }
 };
 
-
 // What a thread keeps from update to update.
 struct Own {
     Measurement measurement;

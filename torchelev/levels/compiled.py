@@ -44,6 +44,7 @@ def settings(cfg: ElevationMapConfig) -> Settings:
         min_gap=float(own.min_gap),
         max_step=float(own.max_step),
         min_support=float(own.min_support),
+        least_support=float(own.least_support),
         min_time=math.inf if cfg.raycast is None else float(cfg.raycast.min_time),
         overlap_height=0.0 if overlap is None else float(overlap.height),
         overlap_radius=0.0 if overlap is None else float(overlap.radius),

@@ -70,6 +70,12 @@ class MapLevels(nn.Module):
         return LevelStatistics(*self.last_numbers.clone().unbind(1))
 
     @property
+    def why_tensors(self) -> str:
+        """Why no compiled code takes these buffers, in a clause; empty where it does."""
+        is_plain = all(value.is_contiguous() for value in self.stored) and self.lower.dtype == torch.float32
+        return "" if is_plain else "the levels are not contiguous float32; load the map by load_state"
+
+    @property
     def compiled(self) -> StoredLevels:
         """The buffers as compiled code updates them, in place."""
         return StoredLevels(self.corner, *self.stored, self.last_numbers)

@@ -73,7 +73,7 @@ struct Choice : Tidying {
             const int64_t q = l * cells;
             const bool is_dust = waits || ground.time[c] <= cell.time[q] || cell.lower[q] > height;
             const float rival = height == height && is_dust ? std::min(number, SETTLED) : 0;
-            const bool is_there = cell.support[q] >= std::max({s.min_support, 0.5f, rival});
+            const bool is_there = cell.support[q] >= std::max(s.least_support, rival);
             to.height[l + 1] = is_there ? cell.upper[q] : NAN;
             to.firm |= uint16_t((cell.support[q] >= SETTLED) << (l + 1));
         }

@@ -26,8 +26,8 @@ struct MapUpdate : levels::Choice {
     };
     // Which rows or columns of a window were in it before.
     static Range staying(int64_t now, int64_t before, int64_t size) {
-        const int64_t begin = std::clamp<int64_t>(before - now, 0, size), end = std::clamp<int64_t>(before - now + size, 0, size);
-        return {begin, std::max(begin, end)};
+        const int64_t shift = std::clamp(before - now, -size, size);
+        return {std::max<int64_t>(shift, 0), std::min(shift + size, size)};
     }
 
     // Move to the window of the map, and age: `move`, `age`.

@@ -22,7 +22,7 @@ struct Cluster;  // of sorting.h
 // Memory of a thread, kept between updates.
 struct Scratch {
     Points points;
-    std::vector<Sight> sights;
+    std::vector<Sight> sights;                 // of at least as many sensors
     std::vector<float> x, y, highest, lowest;  // centres of the cells [m], rays over them [m]
     std::vector<float> bottom, top;            // (H W) [m] of the scan's points
     std::vector<int32_t> number, list;         // (H W) of the scan's points; place in `complex`, -1 for none
@@ -56,10 +56,10 @@ struct Map {
     int64_t statistics[STATISTICS] = {};
 
     explicit Map(Update& u)
-        : u(u), s(u.settings.levels), ground(u.state), measured(u.measurement), own(u.memory.get<Scratch>()), H(u.sizes.H),
-          W(u.sizes.W), L(u.sizes.L), S(u.sizes.S), N(u.sizes.N), M(measured.number), cells(u.cells()), parts{u.threads, u.threads},
-          g2(*ground.statistics.disagreement * *ground.statistics.disagreement),
-          sights{SightGrid(s), own.sights, s.min_gap} {}
+        : u(u), s(u.settings.levels), ground(u.state), measured(u.measurement), own(u.memory.get<Scratch>()),
+          H(u.sizes.H), W(u.sizes.W), L(u.sizes.L), S(u.sizes.S), N(u.sizes.N), M(measured.number), cells(u.cells()),
+          parts{u.threads, u.threads}, g2(*ground.statistics.disagreement * *ground.statistics.disagreement),
+          sights{SightGrid(s), own.sights, size_t(S), s.min_gap} {}
 
     static int64_t ring(int64_t k, int64_t size) { return ((k % size) + size) % size; }
     int64_t place(int64_t c) const { return row[int32_t(c) / int32_t(W)] + column[int32_t(c) % int32_t(W)]; }

@@ -8,6 +8,7 @@
 
 #include "generated.h"
 #include "levels/kernel/points.h"
+#include "levels/kernel/surfaces.h"
 #include "stages/visibility/azimuth.h"
 
 namespace levels {
@@ -31,9 +32,9 @@ struct SightGrid {
         const int32_t bin = int32_t(visibility::azimuth_fraction(x, y) * float(azimuths));
         return std::min(bin, azimuths - 1);
     }
-    int32_t range_bin(float rho) const { return std::min(int32_t(rho / resolution), ranges - 2); }
+    int32_t range_bin(float rho) const { return int32_t(std::min(rho / resolution, float(ranges - 2))); }
     // The row of the rays that end more than a cell behind a place.
-    int32_t row_behind(float d) const { return std::min(int32_t(d / resolution + MARGIN), ranges - 1); }
+    int32_t row_behind(float d) const { return int32_t(std::min(d / resolution + MARGIN, float(ranges - 1))); }
     int32_t elevation_bin(float rho, float dz) const {
         const float fraction = 0.5f + 0.5f * (dz / std::max(rho + std::fabs(dz), 1e-12f));
         return std::min(int32_t(fraction * float(elevations)), elevations - 1);
@@ -117,7 +118,7 @@ struct Sight {
         float d;
         const float found = nearest_around(x, y, middle, size, d);
         const float slope = std::fabs(middle - origin[2]) / std::max(d, size.resolution);
-        const float noise = 3.0f * std::sqrt(variance) + (2 * d / float(size.elevations)) * ((1 + slope) * (1 + slope));
+        const float noise = GATE * std::sqrt(variance) + (2 * d / float(size.elevations)) * ((1 + slope) * (1 + slope));
         const bool is_thick = high - low >= 2 * noise, is_steep = 2 * MARGIN * size.resolution * slope >= noise;
         const float behind = found - d;
         const bool crosses = is_thick || (is_steep && behind * slope >= noise);
@@ -128,12 +129,16 @@ struct Sight {
 // What the rays of all sensors saw.
 struct Sights {
     SightGrid size;
-    std::vector<Sight>& of;
+    std::vector<Sight>& kept;  // between updates, also of further sensors
+    size_t number;
     float min_gap;
+
+    Sight* begin() const { return kept.data(); }
+    Sight* end() const { return kept.data() + number; }
 
     // Whether a place below a surface at height `top` over a cell is free.
     bool are_free_below(float x, float y, float top) const {
-        for (const Sight& sight : of)
+        for (const Sight& sight : *this)
             for (const float part : HEIGHTS)
                 if (sight.is_free(x, y, top - part * min_gap, size)) return true;
         return false;
@@ -143,7 +148,7 @@ struct Sights {
     void heights(float x, const float* y, int64_t W, float* highest, float* lowest) const {
         constexpr int64_t BLOCK = 64;
         std::fill_n(highest, W, -INFINITE), std::fill_n(lowest, W, INFINITE);
-        for (const Sight& sight : of) {
+        for (const Sight& sight : *this) {
             const float dx = x - sight.origin[0];
             for (int64_t first = 0; first < W; first += BLOCK) {
                 float d[BLOCK];

@@ -11,8 +11,11 @@ struct Scan : Map {
 
     void find_points() {
         find_centers();
-        own.sights.resize(S);
-        for (int64_t k = 0; k < S; k++) std::copy_n(&measured.origin[3 * k], 3, own.sights[k].origin);
+        if (own.sights.size() < sights.number) own.sights.resize(sights.number);
+        for (int64_t k = 0; k < S; k++) {
+            std::copy_n(&measured.origin[3 * k], 3, own.sights[k].origin);
+            own.sights[k].slopes.reserve(int64_t(s.ranges) * s.azimuths);
+        }
         sights.size.ranges = std::min(sights.size.ranges, reach());
         own.points.resize(M), own.points.casts = measured.casts.data(), own.points.used = measured.used.data();
         const Window window(ground.corner, measured.anchor, u.sizes, float(s.resolution));
@@ -39,7 +42,7 @@ struct Scan : Map {
     // How many rows of the table of slopes the cells ask for: `row_behind`, and one that stays blank.
     int32_t reach() const {
         float farthest = 0;
-        for (const Sight& sight : own.sights)
+        for (const Sight& sight : sights)
             for (const float x : {own.x.front(), own.x.back()})
                 for (const float y : {own.y.front(), own.y.back()})
                     farthest = std::max(farthest, horizontal(x - sight.origin[0], y - sight.origin[1]));

@@ -35,7 +35,7 @@ struct Sorting : Scan {
     void sort_points() {
         own.is_aside.assign(M, 0);
         own.list.assign(cells, -1), own.complex.clear(), own.first.assign(1, 0);
-        const int64_t most = std::min(cells, M);  // reserved at once: later updates of this size allocate nothing
+        const int64_t most = std::min(cells, M);  // reserved at once: later updates allocate for more surfaces alone
         for (std::vector<int32_t>* values : {&own.complex, &own.first, &own.next}) values->reserve(most + 1);
         own.simple.resize(most), own.waiting.reserve(most), own.sorted.resize(M), own.clusters.resize(parts.number);
         parts(own.num_touched, [&](int64_t, int64_t begin, int64_t end) {
@@ -99,7 +99,8 @@ struct Sorting : Scan {
             }
             Cluster& last = clusters.back();
             const float w = 1 / measured.noise[m];
-            last.upper = std::max(last.upper, z[m]), last.end = k + 1, last.weight += w, last.lift += w * (z[m] - last.lower), last.number++;
+            last.upper = std::max(last.upper, z[m]), last.end = k + 1, last.number++;
+            last.weight += w, last.lift += w * (z[m] - last.lower);
             last.above &= !own.points.used[m];
         }
     }
@@ -141,7 +142,8 @@ struct Sorting : Scan {
             }
             if (to_ground <= s.min_gap && to_ground <= to_level) continue;
             if (to_level <= s.min_gap) {
-                const bool stands = !known && !clusters[rank].above && found.lower < cell.lower[nearest * cells] && !floats(c, found.lower);
+                const bool is_below = !clusters[rank].above && found.lower < cell.lower[nearest * cells];
+                const bool stands = !known && is_below && !floats(c, found.lower);
                 cell.fuse(nearest, found, s.max_support);
                 if (stands) found_ground(c, nearest), known = true, g = ground.elevation[c];
             } else {

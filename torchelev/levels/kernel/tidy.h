@@ -20,7 +20,7 @@ struct Tidying : Sorting {
     }
 
     void tidy() {
-        own.candidates.assign(own.old.begin(), own.old.end());
+        own.candidates.reserve(cells), own.candidates.assign(own.old.begin(), own.old.end());
         for (const int32_t c : own.complex)
             if (!own.had_levels[c]) own.candidates.push_back(c);
         std::atomic<int64_t> merged{0}, cleared{0};
@@ -46,7 +46,7 @@ struct Tidying : Sorting {
         const float *g = ground.elevation + first, *support = ground.support + first;
         const float *high = &own.highest[first], *low = &own.lowest[first];
         const uint8_t* known = ground.validity + first;
-        const float gap = s.min_gap, least = std::max(s.min_support, 0.5f);
+        const float gap = s.min_gap, least = s.least_support;
         for (int64_t n = 0; n < number; n++)
             open[n] |= known[n] & uint8_t((support[n] >= least) & (low[n] < g[n] + 0.5f * gap) & (high[n] >= g[n] + gap));
     }
@@ -67,7 +67,7 @@ struct Tidying : Sorting {
         const float low = own.number[c] ? std::min(own.bottom[c], own.lowest[c]) : own.lowest[c];
         const float floor = ground.validity[c] ? ground.elevation[c] : low;
         if (!(own.highest[c] > floor + RISE * float(s.resolution))) return;
-        for (const Sight& sight : own.sights)
+        for (const Sight& sight : sights)
             top = sight.raise_free_top(top, floor, own.x[i], own.y[j], s.min_gap, sights.size);
     }
 
@@ -81,7 +81,7 @@ struct Tidying : Sorting {
             if (ground.validity[c] && distance(cell.lower[q], cell.upper[q], g, g) < 0.5f * s.min_gap) {
                 cell.remove(l), numbers[MERGED]++;
             } else if (cell.time[q] > s.min_time) {
-                for (const Sight& sight : own.sights)
+                for (const Sight& sight : sights)
                     if (sight.passes(x_of(c), y_of(c), cell.lower[q], cell.upper[q], cell.variance[q], sights.size)) {
                         cell.remove(l), numbers[CLEARED]++;
                         break;

@@ -271,6 +271,7 @@ struct LevelsSettings {
     float min_gap;
     float max_step;
     float min_support;
+    float least_support;
     float min_time;
     float overlap_height;
     float overlap_radius;

@@ -341,6 +341,7 @@ inline Settings default_settings() {
     s.levels.min_gap = float(0.4);
     s.levels.max_step = float(0.3);
     s.levels.min_support = float(3.0);
+    s.levels.least_support = float(3.0);
     s.levels.min_time = float(1.0);
     s.levels.overlap_height = float(1.5);
     s.levels.overlap_radius = float(3.0);
@@ -360,13 +361,13 @@ void run_reset_statistics(Update&);
 void run_subtract_disagreement(Update&);
 void run_age(Update&);
 void run_compensate(Update&);
+void run_raise_levels(Update&);
 void run_fuse(Update&);
 void run_clear_seen_through(Update&);
 void run_clear_other_floors(Update&);
 void run_count_bounded(Update&);
 void run_add_disagreement(Update&);
 void run_rate_surface(Update&);
-void run_raise_levels(Update&);
 }
 constexpr Stage ORDER[] = {
     run_measure,
@@ -390,13 +391,13 @@ constexpr Stage ORDER_WITH_LEVELS[] = {
     run_subtract_disagreement,
     run_age,
     run_compensate,
+    run_raise_levels,
     run_fuse,
     run_clear_seen_through,
     run_clear_other_floors,
     run_count_bounded,
     run_add_disagreement,
     run_rate_surface,
-    run_raise_levels,
 };
 
 constexpr double ISAAC_LAB_X[] = {-0.8, -0.7000000000000001, -0.6000000000000001, -0.5, -0.4, -0.30000000000000004, -0.19999999999999996, -0.09999999999999998, 0.0, 0.09999999999999998, 0.19999999999999996, 0.30000000000000004, 0.40000000000000013, 0.5, 0.6000000000000001, 0.7, 0.8};

@@ -4,9 +4,9 @@
 #include <algorithm>
 #include <cmath>
 
-MapLevels::MapLevels(const Config& cfg)
+MapLevels::MapLevels(const Config& cfg, const LevelsSettings& s)
     : H(cfg.rows()), W(cfg.columns()), L(int64_t(cfg["levels.max_levels"]) - 1), corner{-(H / 2), -(W / 2)},
-      numbers{}, min_gap(float(cfg["levels.min_gap"])), least_support(std::max(float(cfg["levels.min_support"]), 0.5f)) {
+      numbers{}, min_gap(s.min_gap), least_support(s.least_support) {
     for (std::vector<float>* values : {&lower, &upper, &variance, &support, &time}) values->resize(L * H * W);
     free_top.resize(H * W), is_open.resize(H * W);
     forget();

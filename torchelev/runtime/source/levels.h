@@ -40,7 +40,7 @@ class MapLevels {
     void blank(int64_t place);
 
   public:
-    explicit MapLevels(const Config& cfg);
+    MapLevels(const Config& cfg, const LevelsSettings& settings);
 
     int64_t number() const { return L; }  // of surfaces besides the ground
     StoredLevels tensors();               // as updates change them

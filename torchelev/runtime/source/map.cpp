@@ -56,7 +56,7 @@ torchelev_map::torchelev_map(const std::string& text, const std::string& where, 
     }
     static_assert(sizeof(MapState) == sizeof addresses && std::size(STATE) == NUMBER_OF_TENSORS);
     std::memcpy(static_cast<void*>(&state), addresses, sizeof state);
-    if (cfg.has_levels()) levels = std::make_unique<MapLevels>(cfg);
+    if (cfg.has_levels()) levels = std::make_unique<MapLevels>(cfg, settings.levels);
     if (levels)
         for (const Stored& tensor : levels->stored()) stored.push_back(tensor);
     covariance.resize(36 * limits.max_sensors);

@@ -142,7 +142,8 @@ void set_levels(const Config& cfg, LevelsSettings& s) {
     s.overlap_radius = has_overlap ? float(cfg["overlap.radius"]) : 0;
     set_sight(cfg, s);
     s.min_gap = float(cfg["levels.min_gap"]), s.max_step = float(cfg["levels.max_step"]);
-    s.min_support = float(cfg["levels.min_support"]), s.by_gap = cfg.word("levels.separation") == "gap";
+    s.min_support = float(cfg["levels.min_support"]), s.least_support = std::max(s.min_support, 0.5f);
+    s.by_gap = cfg.word("levels.separation") == "gap";
     s.max_blind = int32_t(std::min(cfg["levels.max_blind"], 1e3) / cfg["grid.resolution"]);
 }
 

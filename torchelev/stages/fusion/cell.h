@@ -15,7 +15,8 @@ INLINE Consensus<V> estimate_consensus(const Points& points, const Prior<V>& pri
     const V gate_at = gate_variance(prior.variance, s);
     points.each([&](const Point<V>& q) {
         agreeing += number_if<V>(agrees(q, prior.elevation, gate_at, s));
-        misfit += misfit_of(q, prior.elevation, gate_at, s), weight += q.weight, moment += q.weight * q.z, shared += q.weight * q.shared;
+        misfit += misfit_of(q, prior.elevation, gate_at, s);
+        weight += q.weight, moment += q.weight * q.z, shared += q.weight * q.shared;
     });
     points.add_up(agreeing, misfit, weight, moment, shared);
     const Flag<V> trusted = trust_majority(points.number, agreeing, prior.known);

@@ -46,8 +46,8 @@ def resolve_contested(
 ) -> tuple[Float[Tensor, "B C"], Int[Tensor, "B C"]]:
     """Resolve the contested cells: return all heights [m], and the side of each cell: +1 top, -1 ground, 0 no step.
 
-    A contested cell gets the robust mean of its points, or, if it is marked as a step or too many of its points are far
-    from that mean, the height of one end of the step. The other cells keep their `height`. `width` counts cells along
+    A contested cell gets the robust mean of its points, or, if it is marked as a step or its points do not fit that
+    mean, the height of one end of the step. The other cells keep their `height`. `width` counts cells along
     y, `relief` is in [m].
     """
     settled, side = robust_mean(points), torch.zeros_like(points.mean)
