@@ -128,7 +128,7 @@ class TruthSight(BlindSight):
 
 def _mountings(cfg: TerrainNavConfig) -> list[Tensor]:
     """Return T_base_sensor (4, 4) of the cameras on the rim of the robot's body."""
-    # Headings are rounded to float32, on which the recorded rollout in tests/answers.npz depends.
+    # Headings are rounded to float32, on which the recorded rollout in tests/answers.npz.xz depends.
     yaws_deg = torch.tensor(cfg.sight.camera_yaws_deg).deg2rad().double().rad2deg().tolist()
     body, pitch_deg = cfg.robot, cfg.sight.camera_pitch_deg
     return [mount_on_rim(body.length, body.width, yaw_deg, pitch_deg).float() for yaw_deg in yaws_deg]
