@@ -95,9 +95,12 @@ def test_held_out_points_are_the_truth_of_real_scans():
         [[0.1, 0.1, z] for z in (0.28, 0.3, 0.35)] + [[-0.9, 0.9, 1.0]] + [[-0.9, -0.9, z] for z in (0.0, 0.0, 0.2)],
         np.float32,
     )
-    truth, seen = _held_out(SETUP, [frame(points)], [frame()])
+    given = np.array([[0.1, 0.1, 0.33], [0.9, 0.9, 0.0]], np.float32)
+    truth, seen = _held_out(SETUP, [frame(points)], [frame(given)])
     assert truth(0)[2, 2] == pytest.approx(0.3) and np.isnan(truth(0)).sum() == 15
     assert seen.sum() == 2
+    below = given - np.float32([0, 0, 0.3])  # the held-out points hit leaves, another one the ground
+    assert np.isnan(_held_out(SETUP, [frame(points)], [frame(below)])[0](0)).all()
 
 
 @pytest.mark.slow(6)

@@ -50,7 +50,7 @@ def test_refuses_folders_without_scans(tmp_path):
     (tmp_path / "notes.txt").write_text("")
     with pytest.raises(RecordingError, match=r"holds no scan, only \.txt; .* among \.png \.npy \.npz"):
         find_scans(tmp_path, depth=True)
-    with pytest.raises(RecordingError, match="is a file"):
+    with pytest.raises(RecordingError, match="is neither a folder of scans nor a bag"):
         find_scans(tmp_path / "notes.txt")
 
 
