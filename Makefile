@@ -154,12 +154,13 @@ peers: $(PEERS)/.ready  ## compare with other maps, in the environment .venv-pee
 
 matrix: $(MATRIX:%=on-%)  ## run the library's quick tests on Python 3.10, 3.12 and 3.13, where they are installed
 
+# The first Python of a version that runs: on the path, or of pyenv.
+find_python = $(shell for python in python$(1) $$(ls -d $${PYENV_ROOT:-$$HOME/.pyenv}/versions/$(1).*/bin/python 2>/dev/null); \
+	do $$python -c '' 2>/dev/null && echo $$python && break; done)
+
 on-%:
-	@for python in python$* $$(ls -d $${PYENV_ROOT:-$$HOME/.pyenv}/versions/$*.*/bin/python 2>/dev/null); do \
-		if $$python -c '' 2>/dev/null; then \
-			exec $(MAKE) --no-print-directory VENV=.venv-$* PYTHON=$$python EXTRAS=io,dev test-library; \
-		fi; \
-	done; echo "Python $* is not installed here: skipped"
+	@python=$(call find_python,$*); [ -n "$$python" ] || { echo "Python $* is not installed here: skipped"; exit 0; }; \
+	exec $(MAKE) --no-print-directory VENV=.venv-$* PYTHON=$$python EXTRAS=io,dev test-library
 
 test-library: setup
 	@$(BIN)/python -c 'import sys, torch; print("Python", sys.version.split()[0], "torch", torch.__version__)'
@@ -169,19 +170,16 @@ wheel: setup  ## build a wheel that carries the C++ libraries, for processors of
 	$(BIN)/python -m torchelev.app.build_ahead
 	$(BIN)/python -m hatchling build -t wheel
 
+test-wheel: $(addprefix wheel-on-,3.10 3.11 3.12 3.13)  ## install the wheel on each Python, and run the demo; 5 GB for each
+
 # As a user installs it: no checkout in the way, and the packages that pip chooses.
-test-wheel: wheel  ## install the wheel on Python 3.10 to 3.13, where they are, and run the demo; 5 GB for each
-	@for version in 3.10 3.11 3.12 3.13; do \
-		for python in python$$version $$(ls -d $${PYENV_ROOT:-$$HOME/.pyenv}/versions/$$version.*/bin/python 2>/dev/null); do \
-			$$python -c '' 2>/dev/null || continue; \
-			place=$$(mktemp -d) && $$python -m venv $$place/venv && \
-			$$place/venv/bin/python -m pip install --quiet --disable-pip-version-check "$$(ls $(CURDIR)/dist/*.whl)[io]" && \
-			(cd $$place && venv/bin/torchelev demo --out demo.png && ls -l demo.png && venv/bin/python -c \
-				"import torch, torchelev; print('Python $$version, torch', torch.__version__, torchelev.ElevationMap().backend)") \
-				|| exit 1; \
-			rm -rf $$place; break; \
-		done; \
-	done
+wheel-on-%: wheel
+	@python=$(call find_python,$*); [ -n "$$python" ] || { echo "Python $* is not installed here: skipped"; exit 0; }; \
+	place=$$(mktemp -d) && $$python -m venv $$place/venv && \
+	$$place/venv/bin/python -m pip install --quiet --disable-pip-version-check "$$(ls $(CURDIR)/dist/*.whl)[io]" && \
+	cd $$place && venv/bin/torchelev demo --out demo.png && ls -l demo.png && venv/bin/python -c \
+		"import torch, torchelev; print('Python $*, torch', torch.__version__, torchelev.ElevationMap().backend)" && \
+	rm -rf $$place
 
 lint: setup  ## check style, and that imports go downwards
 	$(BIN)/ruff check --no-cache .

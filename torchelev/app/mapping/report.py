@@ -13,7 +13,7 @@ from torchelev.io import MappingRun
 if TYPE_CHECKING:
     from torchelev.elevation_map import ElevationMap
 
-_MANY = 0.25  # share of the points
+_MANY_OVERHANGS = 0.25  # share of the finite points
 _MIN_USED = 0.01  # of the finite points; with fewer, the map does not show the recorded place
 
 
@@ -85,7 +85,7 @@ def suggest_options(run: MappingRun, fixed: bool, knows_base: bool) -> list[str]
             "note      overlap clearance is off; give --extrinsics (or --sensor-height for a folder) to enable it"
         )
     overhang = run.counts["rejected_overhang"] / max(run.num_points - run.counts["rejected_invalid"], 1)
-    if overhang > _MANY and run.emap.levels is None:
+    if overhang > _MANY_OVERHANGS and run.emap.levels is None:
         notes.append(
             f"note      {100 * overhang:.0f} % of the points lie above the exclusion ramp, like walls and trees, and "
             "are not mapped; --levels 3 maps what hangs over the ground, sensor.exclusion of --config sets the ramp"

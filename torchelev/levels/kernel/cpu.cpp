@@ -4,7 +4,7 @@
 
 namespace {
 
-using levels::Cell, levels::BLOCK;
+using levels::Cell;
 
 struct MapUpdate : levels::Choice {
     using Choice::Choice;
@@ -50,15 +50,10 @@ struct MapUpdate : levels::Choice {
     // List the cells with levels, and age these: `age`.
     void find_old() {
         own.had_levels.assign(cells, 0), own.old.clear(), own.old.reserve(cells);
-        for (int64_t first = 0; first < cells; first += BLOCK) {
-            const int64_t end = std::min(first + BLOCK, cells);
-            if (!any_levels(first, end - first)) continue;  // mostly
-            for (int64_t p = first; p < end; p++) {
-                if (!has_levels(p)) continue;
-                const int32_t c = cell_of(int32_t(p));
-                own.had_levels[c] = 1, own.old.push_back(c), fetch(cell_at(p));
-            }
-        }
+        for_levels([&](int64_t p) {
+            const int32_t c = cell_of(int32_t(p));
+            own.had_levels[c] = 1, own.old.push_back(c), fetch(cell_at(p));
+        });
         for (const int32_t c : own.old) grow_older(cell_at(place(c)));
     }
 
@@ -88,19 +83,18 @@ struct MapUpdate : levels::Choice {
         }
         measured.counts.used -= number;
     }
-};
 
-// Raise all surfaces as drift compensation raised the ground: `raise_surfaces`.
-void raise(const StoredLevels& to, int64_t L, int64_t cells, float height) {
-    for (int64_t first = 0; first < L * cells; first += BLOCK) {
-        const int64_t end = std::min(first + BLOCK, L * cells);
-        int32_t any = 0;
-        for (int64_t p = first; p < end; p++) any |= to.support[p] > 0;
-        for (int64_t p = first; any && p < end; p++)  // mostly none
-            if (to.support[p] > 0) to.lower[p] += height, to.upper[p] += height;
+    // Raise all surfaces as drift compensation raised the ground: `raise_surfaces`.
+    void raise(float height) const {
+        for_levels([&](int64_t p) {
+            const Cell cell = cell_at(p);
+            for (int64_t q = 0; q < L * cells; q += cells)
+                if (cell.support[q] > 0) cell.lower[q] += height, cell.upper[q] += height;
+        });
+        float* const free_top = u.levels.free_top;
+        for (int64_t p = 0; p < cells; p++) free_top[p] += height;
     }
-    for (int64_t p = 0; p < cells; p++) to.free_top[p] += height;
-}
+};
 
 }  // namespace
 
@@ -108,5 +102,5 @@ extern "C" void run_sort_levels(Update& u) { MapUpdate(u).run(); }
 
 extern "C" void run_raise_levels(Update& u) {
     const float height = *u.state.statistics.drift_correction;
-    if (u.settings.compensate.has_drift && height != 0) raise(u.levels, u.sizes.L, u.cells(), height);
+    if (u.settings.compensate.has_drift && height != 0) MapUpdate(u).raise(height);
 }

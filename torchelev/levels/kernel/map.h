@@ -105,6 +105,16 @@ struct Map {
     }
     bool has_levels(int64_t p) const { return any_levels(p, 1); }
 
+    // Call `work(p)` for the places in the ring that have levels.
+    template <class Work> void for_levels(const Work& work) const {
+        for (int64_t first = 0; first < cells; first += BLOCK) {
+            const int64_t end = std::min(first + BLOCK, cells);
+            if (!any_levels(first, end - first)) continue;  // mostly
+            for (int64_t p = first; p < end; p++)
+                if (has_levels(p)) work(p);
+        }
+    }
+
     // Whether rays passed below a surface at height `top` over a cell: it hangs free.
     bool floats(int64_t c, float top) const {
         if (!(own.lowest[c] < top - HEIGHTS[0] * s.min_gap)) return false;  // mostly
