@@ -8,10 +8,17 @@ from PIL import Image
 
 from tests.app.drives import sensor_poses, value_at, world_points, write_poses
 from tests.io.bags.synthetic import CAMERA, START, T_BASE_CAMERA, Scan, Writer
+from torchelev.channels.views import build_libraries
 from torchelev.io.export import load_npz
 from torchelev.sim.poses import pose
 
 LABELS = "/camera/semantic/image"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def built():
+    """The C++ of channels is there: the first use on a machine says on stderr that it is built."""
+    build_libraries()
 
 
 def base_at(seconds):
