@@ -3,7 +3,9 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 # Files that take longest come first, in the order of tests/conftest.py; a worker that is done gets the next one.
-PYTEST := -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
+# One worker more than there are cores, since tests of networks and of processes mostly wait.
+WORKERS ?= $(shell expr $$(getconf _NPROCESSORS_ONLN) + 1)
+PYTEST := -m pytest --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
 # `make matrix` leaves out what needs reinforcement learning, and compares no recorded answers: they are of one torch.
 MATRIX := 3.10 3.12 3.13
 MATRIX_TESTS := tests --ignore tests/envs --ignore tests/training --ignore tests/gym --ignore tests/benchmarks \
@@ -39,7 +41,9 @@ setup: $(BIN)/.ready  ## make the environment .venv
 demo: $(BIN)/.demo-ready  ## simulate a walk, map it, write demo.png
 	$(BIN)/python -m torchelev demo --out demo.png
 
-# Workers and the programs that they start share the cores: threads that wait busily would hold them up.
+# Workers and the programs that they start share the cores, and what Python compiled: threads that wait busily would hold
+# them up.
+unexport PYTHONDONTWRITEBYTECODE
 test test-fast test-library test-mjlab test-mujoco test-isaaclab test-newton test-genesis: export OMP_WAIT_POLICY = PASSIVE
 
 test: setup  ## run all tests, on all cores
@@ -138,6 +142,7 @@ test-mjlab: $(MJLAB)/.ready  ## run the observation term in mjlab, in the enviro
 # Peers are pinned; VDBFusion has wheels for Python 3.6 to 3.10 only, and runs in a second environment where there is one.
 PEERS_PYTHON ?= $(shell ls -d $${PYENV_ROOT:-$$HOME/.pyenv}/versions/3.10.*/bin/python 2>/dev/null | head -1)
 PEERS_RECORDINGS ?=
+PEERS_PROGRAMS ?=
 $(PEERS)/.ready: benchmarks/peers/requirements.txt $(BIN)/.demo-ready
 	@echo "Installing PyTorch, Open3D and the other peers into $(PEERS) and $(PEERS)-310, nowhere else: 5 GB."
 	$(PYTHON) -m venv $(PEERS)
@@ -149,7 +154,7 @@ $(PEERS)/.ready: benchmarks/peers/requirements.txt $(BIN)/.demo-ready
 
 peers: $(PEERS)/.ready  ## compare with other maps, in the environment .venv-peers; under thirty minutes
 	$(PEERS)/bin/python -W ignore -m benchmarks.peers --python $(PEERS)-310/bin/python \
-		$(if $(PEERS_RECORDINGS),--recordings $(PEERS_RECORDINGS))
+		$(if $(PEERS_RECORDINGS),--recordings $(PEERS_RECORDINGS)) $(PEERS_PROGRAMS:%=--program %)
 	$(BIN)/python -m docs.readme_tables
 
 matrix: $(MATRIX:%=on-%)  ## run the library's quick tests on Python 3.10, 3.12 and 3.13, where they are installed

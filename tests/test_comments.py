@@ -51,6 +51,7 @@ def parsed(path):
     return ast.parse(path.read_text())
 
 
+@functools.cache
 def prose_of(path):
     """Comments and docstrings of a file."""
     if path.suffix != ".py":

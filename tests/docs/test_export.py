@@ -23,7 +23,7 @@ def page():
     return run_blocks(path, [block for block in code_blocks(path.read_text()) if block.language == "python"])
 
 
-@pytest.mark.slow(10)
+@pytest.mark.slow(30)
 def test_the_program_runs_without_torchelev_to_the_bit(page, tmp_path):
     torch.manual_seed(1)
     inputs = [page["measure"](N) for N in (700, 40, 1200)]

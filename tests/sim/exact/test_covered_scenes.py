@@ -11,7 +11,7 @@ from torchelev.sim.exact.sensors import cast
 
 @pytest.mark.parametrize("scene", scenes.all_scenes(), ids=lambda scene: scene.name)
 def test_vertical_rays_hit_ground_and_ceiling(scene):
-    xy = torch.rand(400, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 8 - 2.5
+    xy = places(scene)
     for feet in (0.05, 1.45, 2.9):  # where a robot may stand
         ground = scene.truth(xy, below=feet)
         ceiling = scene.ceiling(xy, ground)
@@ -23,6 +23,18 @@ def test_vertical_rays_hit_ground_and_ceiling(scene):
             down = cast(scene, start + torch.tensor([0, 0, 1e-3]), torch.tensor([[0.0, 0.0, -1.0]]).double(), 50.0)[0]
             assert down == pytest.approx(2e-3, abs=1e-4)
             assert up == pytest.approx(float(high - low), abs=1e-4) if math.isfinite(high) else not math.isfinite(up)
+
+
+def places(scene):
+    """Some places anywhere (N, 2), and one above each box."""
+    generator = torch.Generator().manual_seed(0)
+    low, high = torch.tensor(
+        [
+            [[-2.5, -2.5, 0.0]] * 40 + [box.low for box in scene.boxes],
+            [[5.5, 5.5, 0.0]] * 40 + [box.high for box in scene.boxes],
+        ]
+    ).double()[..., :2]
+    return torch.lerp(low, high, torch.rand(low.shape, dtype=torch.float64, generator=generator))
 
 
 def within(scene, xy, z):
