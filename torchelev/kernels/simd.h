@@ -130,6 +130,17 @@ inline Lanes gather(const float* values, Flags index) { return gather_as<Lanes>(
 inline Flags gather(const int32_t* values, Flags index) { return gather_as<Flags>(values, index); }
 inline Flags gather(const uint8_t* values, Flags index) { return gather_as<Flags>(values, index); }
 
+// Return what a table of eight numbers holds at places in it.
+inline Flags look_up(const int32_t* table, Flags index) {
+#if defined(__AVX2__) && !defined(__clang__)
+    Flags values{};
+    std::memcpy(&values, table, 8 * sizeof *table);
+    return __builtin_shuffle(values, index);
+#else
+    return gather(table, index);
+#endif
+}
+
 // Call `work(k, count)` for the vectors of first to last; a count that is known to the compiler for all but the last.
 template <class Work> inline void for_vectors(int64_t first, int64_t last, const Work& work) {
     for (; first + LANES <= last; first += LANES) work(first, std::integral_constant<int, LANES>());

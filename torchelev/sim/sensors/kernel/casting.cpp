@@ -15,34 +15,66 @@ namespace {
 constexpr int AT_A_TIME = 1024;           // rays that a thread takes
 constexpr float FARTHEST = 8388608.0f;  // [cells] float32 cannot count cells farther out, where the ground is level
 
-// Trace rays from one origin; a lane takes the next ray as soon as its own has ended.
+// Traces rays from one origin; a lane takes the next ray as soon as its own has ended. Groups of lanes take turns, so that
+// one computes while another one waits for memory. Nothing branches on single lanes, and jumps and crossings alternate in
+// a fixed order: processors cannot foresee what rays need.
+template <Surface surface> class Tracer {
+    static constexpr int GROUPS = 2, JUMPS = 4;
+
+    struct Group {
+        Rays rays;
+        int32_t ray[LANES];  // of each lane
+        Lanes measured{};
+        Flags active = ~Flags{}, ends = ~Flags{};
+    };
+
+    const Field& field;
+    const float* directions;
+    const float max_range;
+    const int max_turns;  // a ray crosses at most two borders per cell length, and may try to jump before each
+    const int count;
+    float* distance;
+    int next = 0;
+
+    void cross_cells(Group& group) {
+        Rays& rays = group.rays;
+        const Flags hits = cross<surface>(field, rays, group.active & (rays.level < 0));
+        rays.turns += 1;
+        group.ends = group.active & (hits | (rays.along > max_range) | (rays.turns > max_turns));
+        group.measured = pick(group.ends, pick(hits, rays.along, splat(__builtin_inff())), group.measured);
+    }
+
+    void take_next(Group& group) {
+        for (int l = 0; l < LANES; l++) {
+            distance[group.ray[l]] = group.measured[l];  // a ray that is on its way is overwritten at its end
+            const bool takes = group.ends[l] & (next < count);
+            group.active[l] &= -int(takes | !group.ends[l]);
+            group.ray[l] = takes ? next : group.ray[l], next += takes;
+        }
+    }
+
+  public:
+    Tracer(const Field& field, const float* directions, int count, float resolution, float max_range, float* distance)
+        : field(field), directions(directions), max_range(max_range),
+          max_turns(int(std::min(1e9f, 64 + 8 * max_range / resolution))), count(count), distance(distance) {}
+
+    void run(const float* origin, float resolution) {
+        Group groups[GROUPS]{{{origin, resolution}}, {{origin, resolution}}};
+        for (Group& group : groups)
+            for (int32_t& ray : group.ray) ray = std::min(next++, count - 1);  // some lanes may have the same one
+        while (any(groups[0].active | groups[1].active)) {
+            for (Group& group : groups) group.rays.begin(group.ends, directions, group.ray);
+            for (int k = 0; k < JUMPS; k++)
+                for (Group& group : groups) jump(field, group.rays, group.active & (group.rays.level >= 0));
+            for (Group& group : groups) cross_cells(group), take_next(group);
+        }
+    }
+};
+
 template <Surface surface>
 void trace(const Field& field, const float* origin, const float* directions, int count, float resolution,
            float max_range, float* distance) {
-    // Along a unit vector a ray crosses at most two borders per cell length, and may try to jump before each.
-    const int max_turns = int(std::min(1e9f, 64 + 8 * max_range / resolution));
-    Rays rays{};
-    Flags active{};
-    int ray[LANES], next = 0;
-    for (int l = 0; l < LANES && next < count; l++)
-        ray[l] = next, rays.set(l, origin, directions + 3 * next++, resolution), active[l] = -1;
-    for (int left; (left = count_set(active)) > 0;) {
-        const Flags jumping = active & (rays.level >= 0);
-        const bool jumps = 2 * count_set(jumping) > left;  // a turn is one kind of work: what more of the rays need
-        if (jumps) jump(field, rays, jumping);
-        const Flags hits = jumps ? Flags{} : cross<surface>(field, rays, active & ~jumping);
-        rays.turns -= jumps ? jumping : active & ~jumping;
-        const Flags ends = active & (hits | (rays.along > max_range) | (rays.turns > max_turns));
-        if (!count_set(ends)) continue;
-        for (int l = 0; l < LANES; l++) {
-            if (!ends[l]) continue;
-            distance[ray[l]] = hits[l] ? rays.along[l] : __builtin_inff();
-            if (next < count)
-                ray[l] = next, rays.set(l, origin, directions + 3 * next++, resolution);
-            else
-                active[l] = 0;
-        }
-    }
+    Tracer<surface>(field, directions, count, resolution, max_range, distance).run(origin, resolution);
 }
 
 // Return the boxes of an environment that rays of `max_range` can reach.

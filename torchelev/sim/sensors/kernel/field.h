@@ -14,35 +14,41 @@ inline Lanes power_of_two(Flags exponent) { return (Lanes)((exponent + 127) << 2
 struct Field {
     const float* heights;  // (rows + 1, columns + 1) samples, the rim included
     const float* bounds;   // highest points of the blocks, level by level
-    int32_t offset[TOP + 1];  // where each level begins
+    int32_t offset[8];       // where each level begins
     int rows, columns;     // cells
 };
 
-// Sixteen rays: position in cells and metres as in `Rays`.
+// A ray in each lane, all from one origin: position in cells and metres as in `Rays` of tracing.py.
 struct Rays {
-    Lanes start[3];            // [cells, cells, m]
+    const float* start;  // [cells, cells, m]
+    const float resolution;
     Lanes step[3];             // change per metre along the ray
     Lanes sign[2], inverse[2];  // direction along x and y, and metres along the ray per cell
     Lanes fastest, slowness;   // metres along the ray per cell of the faster of x and y, and per metre of descent
-    Lanes along;               // [m] up to which nothing is hit
+    Lanes along{};             // [m] up to which nothing is hit
     Lanes cell[2];             // that the ray is in
-    Flags level;               // of the block to jump over; below 0: intersect the cell
-    Flags turns;               // taken so far
+    Flags level{};             // of the block to jump over; below 0: intersect the cell
+    Flags turns{};             // taken so far
 
-    void set(int lane, const float* origin, const float* direction, float resolution) {
+    Rays(const float* origin, float resolution) : start(origin), resolution(resolution) {}
+
+    // Start the rays of some lanes; `ray` has the index of each lane's.
+    void begin(Flags fresh, const float* directions, const int32_t* ray) {
+        Flags first;
+        std::memcpy(&first, ray, sizeof first);
         for (int k = 0; k < 3; k++) {
-            const float d = __builtin_isfinite(direction[k]) ? direction[k] : 0;
-            start[k][lane] = origin[k], step[k][lane] = k < 2 ? d / resolution : d;
+            const Lanes d = gather(directions + k, 3 * first);
+            step[k] = pick(absolute(d) <= __FLT_MAX__, k < 2 ? d / resolution : d, splat(0));
         }
         for (int k = 0; k < 2; k++) {
-            sign[k][lane] = __builtin_copysignf(1, step[k][lane]);
-            const float speed = __builtin_fabsf(step[k][lane]);
-            inverse[k][lane] = 1 / (speed > TINY ? speed : TINY);
-            cell[k][lane] = __builtin_floorf(origin[k]);
+            sign[k] = pick(is_negative(step[k]), splat(-1), splat(1));
+            inverse[k] = 1 / larger(absolute(step[k]), splat(TINY));
+            cell[k] = pick(fresh, splat(__builtin_floorf(start[k])), cell[k]);
         }
-        fastest[lane] = inverse[0][lane] < inverse[1][lane] ? inverse[0][lane] : inverse[1][lane];
-        slowness[lane] = 1 / (-step[2][lane] > TINY ? -step[2][lane] : TINY);
-        along[lane] = 0, level[lane] = FIRST, turns[lane] = 0;
+        fastest = smaller(inverse[0], inverse[1]);
+        slowness = 1 / larger(-step[2], splat(TINY));
+        along = zero_unless(~fresh, along);
+        level = pick_int(fresh, FIRST, level), turns &= ~fresh;
     }
 
     Lanes at(int k, Lanes distance) const { return start[k] + distance * step[k]; }
@@ -57,7 +63,7 @@ inline void jump(const Field& field, Rays& rays, Flags jumping) {
     const Flags last_column = pick_int(is_top, 0, (field.columns - 1) >> level);
     const Lanes row = smaller(larger(rays.at(0, ahead) * inverse_edge, splat(0)), numbers(last_row));
     const Lanes column = smaller(larger(rays.at(1, ahead) * inverse_edge, splat(0)), numbers(last_column));
-    const Flags place = gather_as<Flags>(field.offset, level) + integers(row) * (last_column + 1) + integers(column);
+    const Flags place = look_up(field.offset, level) + integers(row) * (last_column + 1) + integers(column);
     const Lanes free = (rays.at(2, rays.along) - gather(field.bounds, place)) * rays.slowness;
     const Lanes reach = pick(is_top, splat(ENDLESS), 2 * edge) * rays.fastest;
     const Flags moves = jumping & (free >= 0.5f * rays.fastest), is_through = free >= reach;
