@@ -82,3 +82,13 @@ def test_brightness_alone_tells_values_apart(name):
 def test_both_ends_of_the_map_of_errors_differ_in_blue_which_red_green_blind_readers_see():
     low, high = (matplotlib.colormaps[style.ERRORS](value)[2] for value in (0.1, 0.9))
     assert abs(low - high) > 0.3
+
+
+def test_a_palette_changes_no_colour_that_one_sees():
+    ramps = np.stack(np.meshgrid(np.arange(256), np.arange(256), indexing="ij"), -1).astype(np.uint8)
+    many = Image.fromarray(np.dstack([ramps, ramps[..., :1]]))  # 65,536 colours
+    few = Image.fromarray(np.dstack([ramps // 16 * 16, np.zeros((256, 256), np.uint8)]))
+    assert style._with_palette(many).mode == "RGB"
+    small = style._with_palette(few)
+    assert small.mode == "P"
+    assert np.abs(np.asarray(small.convert("RGB")).astype(int) - np.asarray(few).astype(int)).max() <= 8

@@ -36,6 +36,7 @@ ROBOT_COLOR = "#d55e00"  #: robots, paths and cameras
 GOAL_COLOR = "#e69f00"  #: goals
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  #: of lines (Okabe and Ito)
 MAX_BYTES = 300_000  #: of a picture
+_UNSEEN = 8  # of 255, by which a colour may change
 
 SETTINGS: Mapping[str, Any] = MappingProxyType(
     {
@@ -125,16 +126,23 @@ def png_info() -> PngInfo:
 
 
 def small_png(figure: Figure) -> bytes:
-    """Return a PNG below `MAX_BYTES`: in full colour if that fits, else with a palette, then at lower resolutions."""
+    """Return a PNG below `MAX_BYTES`: with a palette if nobody sees it or to fit, then at lower resolutions."""
     for dpi, colors in ((110, None), (90, None), (100, 256), (75, 256), (55, 256)):
         raw, small = io.BytesIO(), io.BytesIO()
         figure.savefig(raw, format="png", dpi=dpi, **_CROPPED)
         picture = Image.open(raw).convert("RGB")
-        picture = picture.quantize(colors, dither=Image.Dither.NONE) if colors else picture
+        picture = picture.quantize(colors, dither=Image.Dither.NONE) if colors else _with_palette(picture)
         picture.save(small, format="png", optimize=True, pnginfo=png_info())
         if small.tell() < MAX_BYTES:
             break
     return small.getvalue()
+
+
+def _with_palette(picture: Image.Image) -> Image.Image:
+    """Return an RGB picture with a palette of 256 colours, unless a colour would change by more than `_UNSEEN`."""
+    small = picture.quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    colors, others = (np.asarray(each).astype(np.int16) for each in (picture, small.convert("RGB")))
+    return small if np.abs(colors - others).max() <= _UNSEEN else picture
 
 
 def _small_svg(figure: Figure) -> bytes:
