@@ -2,7 +2,7 @@
 
 The class says its `TITLE`, its `SETTINGS`, the module that it `NEEDS` ("" for none), and what it `TAKES`: "points", or
 "depth" where it takes depth images alone. Such files import NumPy and the peer's package, and nothing of torchelev but
-this file.
+this file. `benchmarks/peers/program.py` is for peers that are programs.
 """
 
 from __future__ import annotations

@@ -26,6 +26,8 @@ class About(NamedTuple):
     settings: str
     needs: str  #: module of its package, empty without one
     takes: str  #: "points" or "depth"
+    version: str = ""  #: where no package says it
+    program: str = ""  #: path of the program that it is, if it is one
 
 
 def find_peers() -> list[About]:
@@ -64,9 +66,9 @@ def find_python(peer: About, pythons: list[str]) -> tuple[str | None, list[str]]
 
 
 def version_of(peer: About, python: str) -> str:
-    """Return the version of the package that a peer needs; empty if it needs none, or does not say."""
+    """Return the version of a program, or of the package that a peer needs; empty without one, or if it is unknown."""
     if not peer.needs:
-        return ""
+        return peer.version
     code = (
         "import importlib.metadata as m; "
         f"names = m.packages_distributions().get({peer.needs!r}, [{peer.needs!r}]); print(m.version(names[0]))"
@@ -80,14 +82,33 @@ def _environment() -> dict[str, str]:
     return {**os.environ, **threads, "PYTHONPATH": str(ROOT), "OMP_WAIT_POLICY": "PASSIVE"}
 
 
-class Process:
-    """A peer that runs. What it prints is shown when it ends too early."""
+class Child:
+    """A process that is spoken to by pipes. What it prints is shown when it fails."""
 
-    def __init__(self, peer: About, python: str, setup: Setup) -> None:
-        self._title, self._printed = peer.title, tempfile.TemporaryFile()
-        command = [python, "-W", "ignore", "-m", "benchmarks.peers.worker", peer.name]
+    def __init__(self, title: str, command: list[str]) -> None:
+        self._title, self._printed = title, tempfile.TemporaryFile()
         pipes: dict[str, Any] = dict(stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._printed)
         self._process: Any = subprocess.Popen(command, cwd=ROOT, env=_environment(), **pipes)
+
+    def _failed(self, how: str = "ended early") -> RuntimeError:
+        """End it and return an error with its last words."""
+        self.close()
+        self._printed.seek(0)
+        last = self._printed.read().decode(errors="replace").strip().splitlines()[-1:]
+        return RuntimeError(f"{self._title} {how}: {' '.join(last) or 'it printed nothing'}")
+
+    def close(self) -> None:
+        """End it."""
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.close()
+        self._process.wait()
+
+
+class Process(Child):
+    """A peer of `benchmarks/peers/maps` that runs in a Python."""
+
+    def __init__(self, peer: About, python: str, setup: Setup) -> None:
+        super().__init__(peer.title, [python, "-W", "ignore", "-m", "benchmarks.peers.worker", peer.name])
         self._ask(setup)
 
     def _ask(self, given: Any) -> Any:
@@ -96,10 +117,7 @@ class Process:
             self._process.stdin.flush()
             return pickle.load(self._process.stdout)
         except (EOFError, BrokenPipeError):
-            self.close()
-            self._printed.seek(0)
-            last = self._printed.read().decode(errors="replace").strip().splitlines()[-1:]
-            raise RuntimeError(f"{self._title} ended early: {' '.join(last) or 'it printed nothing'}") from None
+            raise self._failed() from None
 
     def update(self, frame: Frame) -> tuple[float, float]:
         """Give it a scan; return the seconds that it took, and those of all cores."""
@@ -108,9 +126,3 @@ class Process:
     def ground(self) -> tuple[Array, Array | None, int]:
         """Return heights [m], their standard deviations or None, and by how much its memory has grown [bytes]."""
         return self._ask(None)  # type: ignore[no-any-return]
-
-    def close(self) -> None:
-        """End it."""
-        with contextlib.suppress(BrokenPipeError):
-            self._process.stdin.close()
-        self._process.wait()

@@ -131,7 +131,7 @@ def draw(path: Path, result: dict[str, Any]) -> None:
     ax = figure.subplots()
     for k, (peer, values) in enumerate(average(result, CAMERA).items()):
         label = f"{result['peers'][peer]['title']}: {100 * values['coverage']:.0f} % covered"
-        shape = "*" if peer == "torchelev_map" else "osD^vPX"[(k - 1) % 7]
+        shape = "*" if peer == "torchelev_map" else "osD^vPXhd<>"[(k - 1) % 11]
         ax.plot(
             values["p50_ms"], 100 * values["rmse"], shape, color=f"C{k}", markersize=16 if k == 0 else 9, label=label
         )

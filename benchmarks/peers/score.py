@@ -10,6 +10,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from benchmarks.peers.peer import Array
 from benchmarks.peers.process import About, Process
+from benchmarks.peers.program import Program
 from benchmarks.peers.recordings import Recording
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig
 from torchelev.pipeline import rate
@@ -24,7 +25,8 @@ GHOST = 0.1  # [m] error of a cell where something still stands that left
 
 def run(peer: About, python: str, recording: Recording) -> dict[str, Any]:
     """Give a peer all scans of a recording; return its scores."""
-    process, times, caught = Process(peer, python, recording.setup), [], {}
+    process = Program(peer, recording.setup) if peer.program else Process(peer, python, recording.setup)
+    times, caught = [], {}
     try:
         for scan, frame in enumerate(recording.frames):
             times.append(process.update(frame))

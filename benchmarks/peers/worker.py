@@ -12,9 +12,9 @@ import time
 from benchmarks.peers.peer import Peer
 
 
-def resident():
-    """Return the memory [bytes] of this process."""
-    with open("/proc/self/statm") as file:
+def resident(process="self"):
+    """Return the memory [bytes] of a process, by its number; of this one without it."""
+    with open(f"/proc/{process}/statm") as file:
         return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 

@@ -114,21 +114,25 @@ def test_a_walk_knows_its_ground():
 
 
 @pytest.mark.slow(6)
-def test_the_command_measures_and_a_new_peer_is_one_file(tmp_path, monkeypatch):
-    """Two peers run as processes, a third cannot be imported and is named."""
+def test_the_command_measures_and_a_new_peer_is_one_file(tmp_path, monkeypatch, cell_means):
+    """Two peers and a program run as processes; another peer cannot be imported and is named."""
     walk = _simulate("stairs", stairs(), [(-0.5, 0.0), (-0.3, 0.0)], CAMERA, T_CAMERA)
     monkeypatch.setattr(command.recordings, "simulated", lambda: iter([walk]))
-    options = ["--only", "torchelev_map", "--only", "mean", "--only", "vdbfusion", "--out", str(tmp_path)]
+    only = [f"--only={name}" for name in ("torchelev_map", "mean", "vdbfusion", "cell_means")]
+    options = [*only, "--program", str(cell_means), "--out", str(tmp_path)]
     done = CliRunner().invoke(command.main, options, catch_exceptions=False)
     assert (
         done.exit_code == 0
         and "VDBFusion is left out (ModuleNotFoundError: No module named 'vdbfusion')" in done.output
     )
     result = json.loads((tmp_path / "peers.json").read_text())
-    assert list(result["peers"]) == ["torchelev_map", "mean"] and (tmp_path / "peers.png").exists()
-    for scores in result["recordings"]["stairs"].values():
+    assert list(result["peers"]) == ["torchelev_map", "mean", "cell_means"] and (tmp_path / "peers.png").exists()
+    rows = result["recordings"]["stairs"]
+    assert rows["cell_means"]["rmse"] == pytest.approx(rows["mean"]["rmse"], abs=1e-6)
+    for scores in rows.values():
         assert scores["rmse"] < 0.1 and scores["coverage"] > 0.9 and 0 < scores["p50_ms"] <= scores["p99_ms"]
     text = report.tables(result)
+    assert "| means of a program 1.2 |" in text and "| 1.2 | all points weigh the same |" in text
     assert text.count("**") >= 10 and "depth camera:" in text and "lidar:" not in text and text in done.output
 
 
