@@ -41,9 +41,9 @@ setup: $(BIN)/.ready  ## make the environment .venv
 demo: $(BIN)/.demo-ready  ## simulate a walk, map it, write demo.png
 	$(BIN)/python -m torchelev demo --out demo.png
 
-# Workers and the programs that they start share the cores, and what Python compiled: threads that wait busily would hold
-# them up.
+# Tests start many processes, which would each compile the Python files again.
 unexport PYTHONDONTWRITEBYTECODE
+# Workers and the programs that they start share the cores: threads that wait busily would hold them up.
 test test-fast test-library test-mjlab test-mujoco test-isaaclab test-newton test-genesis: export OMP_WAIT_POLICY = PASSIVE
 
 test: setup  ## run all tests, on all cores

@@ -99,9 +99,15 @@ class Child:
 
     def close(self) -> None:
         """End it."""
+        self._end()
+
+    def _end(self) -> bytes:
+        """End it and return what it sent that nobody read."""
         with contextlib.suppress(BrokenPipeError):
             self._process.stdin.close()
+        left: bytes = self._process.stdout.read()
         self._process.wait()
+        return left
 
 
 class Process(Child):

@@ -37,7 +37,6 @@ A program is started anew for each recording. Its memory counts from when it has
 
 from __future__ import annotations
 
-import contextlib
 import os
 import select
 import struct
@@ -99,10 +98,7 @@ class Program(Child):
 
     def close(self) -> None:
         """End it; refuse bytes that nothing asked for."""
-        with contextlib.suppress(BrokenPipeError):
-            self._process.stdin.close()
-        left = self._process.stdout.read()
-        super().close()
+        left = self._end()
         if left:
             raise RuntimeError(f"{self._title} sent {len(left)} bytes too many; see benchmarks/peers/program.py")
 

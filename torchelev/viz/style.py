@@ -126,7 +126,7 @@ def png_info() -> PngInfo:
 
 
 def small_png(figure: Figure) -> bytes:
-    """Return a PNG below `MAX_BYTES`: with a palette if nobody sees it or to fit, then at lower resolutions."""
+    """Return a PNG below `MAX_BYTES`, with a palette where the change is invisible, in fewer pixels to fit."""
     for dpi, colors in ((110, None), (90, None), (100, 256), (75, 256), (55, 256)):
         raw, small = io.BytesIO(), io.BytesIO()
         figure.savefig(raw, format="png", dpi=dpi, **_CROPPED)

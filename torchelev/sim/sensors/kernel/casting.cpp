@@ -15,11 +15,11 @@ namespace {
 constexpr int AT_A_TIME = 1024;           // rays that a thread takes
 constexpr float FARTHEST = 8388608.0f;  // [cells] float32 cannot count cells farther out, where the ground is level
 
-// Traces rays from one origin; a lane takes the next ray as soon as its own has ended. Groups of lanes take turns, so that
-// one computes while another one waits for memory. Nothing branches on single lanes, and jumps and crossings alternate in
-// a fixed order: processors cannot foresee what rays need.
+// Traces rays from one origin; a lane takes the next ray as soon as its own has ended. Two groups of lanes take turns, so
+// that one computes while the other one waits for memory. Nothing branches on single lanes, and jumps and crossings
+// alternate in a fixed order: processors cannot foresee what rays need.
 template <Surface surface> class Tracer {
-    static constexpr int GROUPS = 2, JUMPS = 4;
+    static constexpr int JUMPS = 4;  // before each crossing
 
     struct Group {
         Rays rays;
@@ -30,10 +30,11 @@ template <Surface surface> class Tracer {
 
     const Field& field;
     const float* directions;
+    const int count;
     const float max_range;
     const int max_turns;  // a ray crosses at most two borders per cell length, and may try to jump before each
-    const int count;
     float* distance;
+    Group groups[2];
     int next = 0;
 
     void cross_cells(Group& group) {
@@ -53,15 +54,16 @@ template <Surface surface> class Tracer {
         }
     }
 
-  public:
-    Tracer(const Field& field, const float* directions, int count, float resolution, float max_range, float* distance)
-        : field(field), directions(directions), max_range(max_range),
-          max_turns(int(std::min(1e9f, 64 + 8 * max_range / resolution))), count(count), distance(distance) {}
-
-    void run(const float* origin, float resolution) {
-        Group groups[GROUPS]{{{origin, resolution}}, {{origin, resolution}}};
+    Tracer(const Field& field, const float* origin, const float* directions, int count, float resolution,
+           float max_range, float* distance)
+        : field(field), directions(directions), count(count), max_range(max_range),
+          max_turns(int(std::min(1e9f, 64 + 8 * max_range / resolution))), distance(distance),
+          groups{{{origin, resolution}}, {{origin, resolution}}} {
         for (Group& group : groups)
             for (int32_t& ray : group.ray) ray = std::min(next++, count - 1);  // some lanes may have the same one
+    }
+
+    void run() {
         while (any(groups[0].active | groups[1].active)) {
             for (Group& group : groups) group.rays.begin(group.ends, directions, group.ray);
             for (int k = 0; k < JUMPS; k++)
@@ -69,13 +71,13 @@ template <Surface surface> class Tracer {
             for (Group& group : groups) cross_cells(group), take_next(group);
         }
     }
-};
 
-template <Surface surface>
-void trace(const Field& field, const float* origin, const float* directions, int count, float resolution,
-           float max_range, float* distance) {
-    Tracer<surface>(field, directions, count, resolution, max_range, distance).run(origin, resolution);
-}
+  public:
+    static void trace(const Field& field, const float* origin, const float* directions, int count, float resolution,
+                      float max_range, float* distance) {
+        Tracer(field, origin, directions, count, resolution, max_range, distance).run();
+    }
+};
 
 // Return the boxes of an environment that rays of `max_range` can reach.
 std::vector<Box> select_near(const Box* boxes, int num_boxes, float max_range) {
@@ -111,8 +113,10 @@ struct Tiles {
     }
 
     void trace_from(int64_t tile, const float* origin, const float* directions, int count, float* distance) const {
-        const auto of_surface = surface == BILINEAR ? trace<BILINEAR> : surface == RISING ? trace<RISING> : trace<FALLING>;
-        of_surface(field(tile), origin, directions, count, resolution, max_range, distance);
+        const auto trace = surface == BILINEAR ? Tracer<BILINEAR>::trace
+                           : surface == RISING ? Tracer<RISING>::trace
+                                               : Tracer<FALLING>::trace;
+        trace(field(tile), origin, directions, count, resolution, max_range, distance);
     }
 
     // A place [m] in the frame of a tile, in cells and metres as rays start there: casting.py.

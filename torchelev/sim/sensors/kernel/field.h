@@ -1,4 +1,4 @@
-// Rays against a height field: tracing.py, sixteen at a time, each as far as it needs.
+// Rays against a height field: tracing.py, one in each lane of a vector, each as far as it needs.
 #pragma once
 
 #include "kernels/simd.h"
@@ -14,14 +14,14 @@ inline Lanes power_of_two(Flags exponent) { return (Lanes)((exponent + 127) << 2
 struct Field {
     const float* heights;  // (rows + 1, columns + 1) samples, the rim included
     const float* bounds;   // highest points of the blocks, level by level
-    int32_t offset[8];       // where each level begins
+    int32_t offset[8];     // where each level begins, and an unused one: what `look_up` takes
     int rows, columns;     // cells
 };
 
 // A ray in each lane, all from one origin: position in cells and metres as in `Rays` of tracing.py.
 struct Rays {
-    const float* start;  // [cells, cells, m]
-    const float resolution;
+    const float* start;        // [cells, cells, m]
+    const float resolution;    // [m]
     Lanes step[3];             // change per metre along the ray
     Lanes sign[2], inverse[2];  // direction along x and y, and metres along the ray per cell
     Lanes fastest, slowness;   // metres along the ray per cell of the faster of x and y, and per metre of descent
