@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchelev.errors import message, require
+from torchelev.site.ending import rest_at_end
 from torchelev.site.storage.interface import InDoubtError, Overtaken
 
 if TYPE_CHECKING:
@@ -46,6 +47,7 @@ class Ranks:
             require(is_ready, "group", "must be initialised", "none", hint)
             self.rank, self.size = dist.get_rank(group), dist.get_world_size(group)
             require(self.rank >= 0, "group", "must hold this process", "another group", "call it on its ranks alone")
+            rest_at_end()
 
     def exchange(self, call: str, make: Callable[[], dict[str, Any]]) -> list[dict[str, Any]]:
         """Return what `make` returns on each rank: JSON values. If it raises on one rank, all raise.

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-import atexit
 import errno
 import functools
 import os
 import re
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from torchelev.errors import require
+from torchelev.site.ending import rest_at_end
 from torchelev.site.storage.interface import InDoubtError
 
 _URL = re.compile(r"s3:/{1,2}([^/]+)(?:/(.*))?")  # a Path has dropped one slash
 _MARKS = ("refs", "repo")  # what a folder holds once it is a repository, of Icechunk 1 and 2
 _ENDPOINTS = ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL")
-_REST = 0.05  # [s]
 _UNCHANGED = "all that was stored before is unchanged"
 _KEYS = "AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"
 _CAUSES = (  # of a failure: a pattern of its text, the number of the system's error, what it means, and how to fix it
@@ -120,8 +118,7 @@ def import_icechunk() -> Any:
 def _prepare(icechunk: Any) -> None:
     """Quieten Icechunk, and let its threads come to rest before Python ends."""
     icechunk.set_logs_filter("error")  # it warns of several writers of local files, which take turns here
-    # A thread of it that still hands over a result while Python ends aborts the process: seen in 1 of 24.
-    atexit.register(time.sleep, _REST)
+    rest_at_end()
 
 
 def open_storage(path: str | Path) -> Any:
