@@ -56,6 +56,19 @@ def test_two_sensors_of_one_call(bias, slope):
     assert claimed(in_one_call(clouds(bias, slope=slope), drift=None)) == pytest.approx(bias / 2**0.5, rel=0.05)
 
 
+@pytest.mark.parametrize("native", ["0", "1"])
+@pytest.mark.parametrize("shared, disagreement", [(19, 0.0), (20, 0.05 / 2**0.5)])
+def test_sensors_count_from_twenty_shared_cells_on(native, shared, disagreement, monkeypatch):
+    monkeypatch.setenv("TORCHELEV_NATIVE", native)
+    emap = ElevationMap(ElevationMapConfig(grid=GRID))
+    points = torch.full((1, 2, 30, 3), torch.nan)
+    for s, first in enumerate((0, 30 - shared)):  # 30 cells in a row for each sensor
+        x = 0.05 * (torch.arange(30) + first) - 1.475
+        points[0, s] = torch.stack([x, torch.full_like(x, 0.025), torch.full_like(x, 0.05 * s - 0.6)], -1)
+    emap.update(points, T[:, None].repeat(1, 2, 1, 1), T, dt=0.1)
+    assert float(emap.statistics.disagreement) == pytest.approx(disagreement, abs=1e-6)
+
+
 @pytest.mark.parametrize("count, share", [(2, 1.0), (3, 3**-0.5)])
 @pytest.mark.parametrize("bias", [0.02, 0.05])
 def test_sensors_that_take_turns(bias, count, share):

@@ -24,6 +24,7 @@ class Zeros {
         }
         return values.get();
     }
+    float* data() const { return values.get(); }
 };
 
 // What the cells say of one sensor.
@@ -40,8 +41,14 @@ struct Bias {
 // What a thread keeps from update to update.
 struct Compared {
     Zeros numbers, moments;      // (H, W, S) points of each sensor; the sum of their heights [m]
+    Zeros views;                 // (H, W) sensors that see a cell
     std::vector<int32_t> cells;  // those that are hit, once for each sensor
     std::vector<Bias> biases;    // (S)
+
+    int64_t count_points(const Update& u);
+    void sum_heights(const Update& u);
+    void compare(float max_bias);
+    void forget();
 };
 
 // Mean height [m] of the points, from which the others count.
@@ -51,19 +58,36 @@ inline float level_of(const Measurement& m) {
     return float(sum / double(std::max<int64_t>(m.inside, 1)));
 }
 
-// Sum the heights of each sensor's points in each cell, without the slope of the ground within a cell.
-inline void sum_heights(const Update& u, float* number, float* moment, std::vector<int32_t>& cells) {
+// Count the points of each sensor in each cell; return how many cells several sensors see.
+inline int64_t Compared::count_points(const Update& u) {
+    const Measurement& m = u.measurement;
+    const int64_t per_sensor = m.number / m.sensors;
+    float *number = numbers.resize(u.cells() * m.sensors), *seen = views.resize(u.cells());
+    moments.resize(u.cells() * m.sensors);
+    cells.clear(), cells.reserve(m.number);  // nothing below runs out of memory and leaves numbers behind
+    int64_t shared = 0;
+    for (int64_t s = 0; s < m.sensors; s++)
+        for (int64_t k = s * per_sensor; k < (s + 1) * per_sensor; k++) {
+            const int32_t cell = m.slot[k];
+            if (cell < 0 || number[size_t(cell) * m.sensors + s]++ > 0) continue;
+            cells.push_back(cell);
+            shared += ++seen[cell] == 2;
+        }
+    return shared;
+}
+
+// Sum the heights of each sensor's points in each shared cell, without the slope of the ground within a cell.
+inline void Compared::sum_heights(const Update& u) {
     const Measurement& m = u.measurement;
     const float size = u.settings.disagreement.resolution, level = level_of(m);
     const int64_t per_sensor = m.number / m.sensors;
     for (int64_t k = 0; k < m.number; k++) {
         const int32_t cell = m.slot[k];
-        if (cell < 0) continue;
+        if (cell < 0 || views.data()[cell] < 2) continue;
         const float x = m.x[k] - (std::floor(m.x[k] / size) + 0.5f) * size;
         const float y = m.y[k] - (std::floor(m.y[k] / size) + 0.5f) * size;
-        const size_t place = size_t(cell) * m.sensors + k / per_sensor;
-        if (number[place]++ == 0) cells.push_back(cell);
-        moment[place] += m.z[k] - level - u.state.gradient_x[cell] * x - u.state.gradient_y[cell] * y;
+        const float height = m.z[k] - level - u.state.gradient_x[cell] * x - u.state.gradient_y[cell] * y;
+        moments.data()[size_t(cell) * m.sensors + k / per_sensor] += height;
     }
 }
 
@@ -94,21 +118,32 @@ inline float deviation_of(const std::vector<Bias>& biases, float before, const D
     return d2 > s.significant_square * noise ? float(std::sqrt(d2)) : 0;
 }
 
+inline void Compared::compare(float max_bias) {
+    const size_t sensors = biases.size();
+    for (const int32_t cell : cells) {
+        if (views.data()[cell] < 2) continue;
+        compare_in_cell(numbers.data() + cell * sensors, moments.data() + cell * sensors, max_bias, biases);
+        views.data()[cell] = 0;  // compared once
+    }
+}
+
+inline void Compared::forget() {
+    const size_t sensors = biases.size();
+    for (const int32_t cell : cells) {
+        std::fill_n(numbers.data() + cell * sensors, sensors, 0.0f);
+        std::fill_n(moments.data() + cell * sensors, sensors, 0.0f);
+        views.data()[cell] = 0;
+    }
+}
+
 inline float compare_sensors(Update& u) {
     const DisagreementSettings& s = u.settings.disagreement;
     locate(u, s.resolution);
-    const size_t sensors = u.measurement.sensors;
-    auto& [numbers, moments, cells, biases] = u.memory.get<Compared>();
-    float *number = numbers.resize(u.cells() * sensors), *moment = moments.resize(u.cells() * sensors);
-    cells.clear(), cells.reserve(u.measurement.number);  // nothing below runs out of memory and leaves numbers behind
-    biases.assign(sensors, Bias());
-    sum_heights(u, number, moment, cells);
-    for (int32_t cell : cells) {
-        float *own = number + cell * sensors, *sums = moment + cell * sensors;
-        compare_in_cell(own, sums, s.max_bias, biases);
-        std::fill_n(own, sensors, 0.0f), std::fill_n(sums, sensors, 0.0f);  // compared once
-    }
-    return deviation_of(biases, *u.state.statistics.disagreement, s);
+    auto& compared = u.memory.get<Compared>();
+    compared.biases.assign(u.measurement.sensors, Bias());
+    if (compared.count_points(u) >= s.min_cells) compared.sum_heights(u), compared.compare(s.max_bias);
+    compared.forget();
+    return deviation_of(compared.biases, *u.state.statistics.disagreement, s);
 }
 
 }  // namespace disagreement
