@@ -16,9 +16,9 @@ from torchelev import ElevationMap, ElevationMapConfig, FilterConfig, GridConfig
 from torchelev.filters import FILTERS
 from torchelev.sim import DepthCamera, Scene, noisy, turn_on_the_spot
 from torchelev.sim.exact.scenes import block, mixed, rough, steps
+from torchelev.viz.palette import ERRORS
 from torchelev.viz.picture import save_image
 from torchelev.viz.plot import Panel, save_layers
-from torchelev.viz.style import ERRORS
 
 PICTURES = Path(__file__).parent / "pictures"
 LENGTH = 4.0  # [m] of the layers' window

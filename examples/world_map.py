@@ -15,8 +15,8 @@ from torchelev import ElevationMap, ElevationMapConfig, GridConfig
 from torchelev.sim import HeightField, Lidar, MountedSensor, PoseErrorConfig, PoseErrors, mount
 from torchelev.sim.poses import pose
 from torchelev.site import SiteMap
+from torchelev.viz.palette import ERRORS
 from torchelev.viz.plot import Panel, save_layers
-from torchelev.viz.style import ERRORS
 
 SIZE, B = 16.0, 4  # [m] side of the area, robots
 

@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from envs.terrain_nav import TerrainNav
 from envs.terrain_nav.outcome import ENDINGS
 from envs.terrain_nav.render import Snapshot, draw_column, snapshot, window_around
-from torchelev.viz.style import ROBOT_COLOR, make_figure, styled, write
+from torchelev.viz.palette import ROBOT_COLOR
+from torchelev.viz.style import make_figure, styled, write
 from training.nav.evaluate import Policy
 from training.nav.train import task_config
 

@@ -20,7 +20,7 @@ from torchelev.app.fleet.mission import Mission
 from torchelev.app.fleet.request import FleetRequest
 from torchelev.io.export import SavedMap, load_npz
 from torchelev.io.poses import read_poses
-from torchelev.viz.style import RATINGS
+from torchelev.viz.palette import RATINGS
 
 _ROOT = Path(__file__).parents[2]
 

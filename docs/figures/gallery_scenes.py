@@ -23,7 +23,7 @@ from docs.moving_picture.walk import make_ground, walk
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig, LevelsConfig
 from torchelev.sim.exact.covered_scenes import bridge
 from torchelev.sim.poses import pose
-from torchelev.viz.style import ROBOT_COLOR, UNKNOWN_COLOR
+from torchelev.viz.palette import ROBOT_COLOR, UNKNOWN_COLOR
 
 _ROOT = Path(__file__).parents[2]
 _ARROW = 0.9 * np.array([[0.36, 0.0], [-0.26, 0.22], [-0.14, 0.0], [-0.26, -0.22]])  # [m] a robot from above

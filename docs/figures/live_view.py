@@ -20,7 +20,7 @@ from torchelev.files.output_files import atomic_file
 from torchelev.viz.live import Page, Player, take_snapshot
 
 PICTURE = Path(__file__).parents[1] / "pictures" / "live_view.png"
-_SIZE, _SHOWN, _COLORS = (1200, 860), (1200, 700), 256
+_SIZE, _SHOWN, _COLORS = (1200, 860), (1200, 700), 128
 # Says that there is no GPU, which a reader of the page need not know.
 _CLOSE_NOTES = "document.querySelectorAll('.mantine-Notification-root').forEach(note => note.remove())"
 

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from benchmarks.self_filter.robot import Scan, make_body, make_cameras, walk
 from torchelev import BodyConfig, ElevationMap, ElevationMapConfig, GridConfig, RobotBody, SensorConfig
-from torchelev.viz.style import HEIGHTS, draw_cells, make_figure, styled, write
+from torchelev.viz.palette import HEIGHTS
+from torchelev.viz.style import draw_cells, make_figure, styled, write
 
 PICTURES = Path(__file__).parents[1] / "pictures"
 GRID = GridConfig(resolution=0.02, length_x=1.4, length_y=1.0)

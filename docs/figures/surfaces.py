@@ -25,7 +25,8 @@ from docs.moving_picture.walk import GRID, make_ground, walk
 from docs.moving_picture.walk import Path as RobotPath
 from torchelev import ElevationMap, ElevationMapConfig, GridConfig
 from torchelev.io.poses import read_poses
-from torchelev.viz.style import DEVIATIONS, HEIGHTS, draw_cells, make_figure, styled, write
+from torchelev.viz.palette import DEVIATIONS, HEIGHTS
+from torchelev.viz.style import draw_cells, make_figure, styled, write
 
 PICTURES = Path(__file__).parents[1] / "pictures"
 _SIZE = (1500, 900)  # [pixels]

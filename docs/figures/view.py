@@ -16,7 +16,7 @@ from PIL import Image
 from docs.moving_picture.stage import add_lights
 from docs.moving_picture.surface import surface
 from torchelev.files.output_files import atomic_file
-from torchelev.viz.style import HEIGHTS, ROBOT_COLOR
+from torchelev.viz.palette import HEIGHTS, ROBOT_COLOR
 
 SIZE = (1200, 640)  # [pixels]
 _SUPERSAMPLING = 2

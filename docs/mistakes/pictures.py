@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from docs.mistakes.cases import Case
 from torchelev import ElevationMap
-from torchelev.viz.style import HEIGHTS, draw_cells, make_figure
+from torchelev.viz.palette import HEIGHTS
+from torchelev.viz.style import draw_cells, make_figure
 
 
 def draw(case: Case, right: ElevationMap, wrong: ElevationMap) -> Figure:

@@ -17,7 +17,7 @@ from docs.moving_picture import batch
 from docs.moving_picture.stage import BACKGROUND, CMAP, LIMITS, Stage
 from docs.moving_picture.walk import Path, make_ground, walk
 from torchelev.files.output_files import atomic_file
-from torchelev.viz.style import ROBOT_COLOR, UNKNOWN_COLOR
+from torchelev.viz.palette import ROBOT_COLOR, UNKNOWN_COLOR
 
 FRAMES_PER_SECOND = 15
 STAGE_SIZE, TILE, GAP = (760, 560), 96, 6  # [pixels]

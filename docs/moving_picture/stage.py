@@ -15,7 +15,7 @@ from PIL import Image
 from docs.moving_picture.legs import leg_joints
 from docs.moving_picture.surface import surface
 from docs.moving_picture.walk import CAMERA, GRID, Moment, Path
-from torchelev.viz.style import HEIGHTS
+from torchelev.viz.palette import HEIGHTS
 
 CMAP, LIMITS = HEIGHTS, (-0.5, 0.8)  # [m]
 BACKGROUND = "#ffffff"

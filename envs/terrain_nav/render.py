@@ -16,7 +16,8 @@ from matplotlib.patches import Polygon
 from envs.terrain_nav.config import TerrainNavConfig
 from envs.terrain_nav.robot import contacts
 from envs.terrain_nav.task import TerrainNav
-from torchelev.viz.style import GOAL_COLOR, HEIGHTS, ROBOT_COLOR, draw_cells, make_figure, styled, write
+from torchelev.viz.palette import GOAL_COLOR, HEIGHTS, ROBOT_COLOR
+from torchelev.viz.style import draw_cells, make_figure, styled, write
 
 _CONTRAST = 0.6  # [m] above and below the level ground that the colours span
 _LOW_COLOR, _HIGH_COLOR = "tab:red", "tab:green"  # of boxes that the robot does not fit under, and of those it does

@@ -106,6 +106,21 @@ def test_ctrl_c_ends_the_wait_of_a_paused_player(run, recording, port, monkeypat
     assert (code, err, waits) == (0, "", ["begun"]) and "closed" in out
 
 
+@pytest.mark.slow(3)
+def test_the_page_opens_before_torch_is_imported(port, tmp_path):
+    code = """
+import sys
+from torchelev.app.commands import view
+view.address_of = lambda server: "torch" in sys.modules
+view.view_command(["--port", sys.argv[1], sys.argv[2]])
+"""
+    file = tmp_path / "map.png"
+    file.touch()
+    command = [sys.executable, "-c", code, str(port), str(file)]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert result.stdout.startswith("open      False") and "is of no kind" in result.stderr
+
+
 @pytest.mark.slow(8)
 def test_ctrl_c_closes_the_page(recording, port):
     command = [

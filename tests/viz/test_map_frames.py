@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from torchelev.viz.map_frames import MapFrames
+from torchelev.viz.palette import ROBOT_COLOR, UNKNOWN_COLOR
 from torchelev.viz.relief import draw_relief, relief_colors, rgb
-from torchelev.viz.style import ROBOT_COLOR, UNKNOWN_COLOR
 
 GREY, ORANGE = rgb(UNKNOWN_COLOR), rgb(ROBOT_COLOR)
 CENTER, PATH = np.zeros(2), np.array([[-1.0, 0.0], [0.0, 0.0]])

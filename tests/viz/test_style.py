@@ -10,7 +10,7 @@ import pytest
 from matplotlib.colors import to_rgb
 from PIL import Image
 
-from torchelev.viz import style
+from torchelev.viz import palette, style
 
 IMAGE = re.compile(rb'base64,([^"]+)"')
 RED, GREEN, BLUE = 0.2126, 0.7152, 0.0722  # of the luminance
@@ -21,7 +21,7 @@ def draw(values):
     figure = style.make_figure(4, 3)
     ax = figure.subplots()
     ax.set_title("a title")
-    style.draw_cells(ax, values, (0, 2, 0, 1), style.HEIGHTS, vmin=0, vmax=1)
+    style.draw_cells(ax, values, (0, 2, 0, 1), palette.HEIGHTS, vmin=0, vmax=1)
     return figure
 
 
@@ -40,7 +40,7 @@ def test_a_noisy_svg_stays_small_and_keeps_its_colours(tmp_path):
     figure = style.make_figure(4, 3)
     noise = np.random.default_rng(0).uniform(0, 1, (300, 240))
     noise[:30] = np.nan
-    style.draw_cells(figure.subplots(), noise, (0, 2, 0, 1), style.HEIGHTS)
+    style.draw_cells(figure.subplots(), noise, (0, 2, 0, 1), palette.HEIGHTS)
     style.write(figure, tmp_path / "noise.svg")
     text, raw = (tmp_path / "noise.svg").read_bytes(), io.BytesIO()
     figure.savefig(raw, format="svg", dpi=100, bbox_inches="tight", pad_inches=0.1)
@@ -68,19 +68,19 @@ def test_unknown_cells_are_grey_and_x_runs_right():
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=100)
     picture = np.asarray(Image.open(buffer).convert("RGB")) / 255
-    for x, color in ((0.5, style.UNKNOWN_COLOR), (1.5, matplotlib.colormaps[style.HEIGHTS](1.0)[:3])):
+    for x, color in ((0.5, palette.UNKNOWN_COLOR), (1.5, matplotlib.colormaps[palette.HEIGHTS](1.0)[:3])):
         column, row = figure.axes[0].transData.transform((x, 0.5))
         np.testing.assert_allclose(picture[picture.shape[0] - 1 - int(row), int(column)], to_rgb(color), atol=0.02)
 
 
-@pytest.mark.parametrize("name", [style.HEIGHTS, style.DEVIATIONS, style.RATINGS])
+@pytest.mark.parametrize("name", [palette.HEIGHTS, palette.DEVIATIONS, palette.RATINGS])
 def test_brightness_alone_tells_values_apart(name):
     colors = matplotlib.colormaps[name](np.linspace(0, 1, 64))[:, :3]
     assert (np.diff(colors @ [RED, GREEN, BLUE]) > 0).all()
 
 
 def test_both_ends_of_the_map_of_errors_differ_in_blue_which_red_green_blind_readers_see():
-    low, high = (matplotlib.colormaps[style.ERRORS](value)[2] for value in (0.1, 0.9))
+    low, high = (matplotlib.colormaps[palette.ERRORS](value)[2] for value in (0.1, 0.9))
     assert abs(low - high) > 0.3
 
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -14,7 +13,6 @@ from torchelev.app.config_file import load_config
 from torchelev.app.mapping.fuse_scans import fuse_all, new_map
 from torchelev.app.mapping.map_request import MapRequest
 from torchelev.app.mapping.open_scans import open_scans
-from torchelev.app.user_error import user_errors
 from torchelev.io import Frame, MappingRun, is_bag
 
 if TYPE_CHECKING:
@@ -22,49 +20,42 @@ if TYPE_CHECKING:
     from torchelev.io.export import SavedMap
     from torchelev.viz.live import Page, Player
 
-_MakePage = Callable[[str, tuple[str, ...], "Mapping[str, ChannelConfig]"], "Page"]
 
-
-def run_view(request: MapRequest | None, host: str, port: int, is_paused: bool) -> None:
-    """Show the recording, walk or map until Ctrl-C; bad input becomes a one-line click error.
+def run_view(request: MapRequest | None, server: Any, is_paused: bool) -> None:
+    """Show the recording, walk or map until Ctrl-C, which raises KeyboardInterrupt.
 
     Args:
         request: a recording, or a saved map; None: the demo's walk.
-        host: address that the page listens on.
-        port: of the page.
+        server: of `open_server`, which serves the page.
         is_paused: wait at the first scan.
+
+    Raises:
+        RecordingError, ValueError, OSError: for bad input.
     """
-
-    def make_page(title: str, layers: tuple[str, ...], channels: Mapping[str, ChannelConfig]) -> Page:
-        from torchelev.viz.live import Page
-
-        page = Page(title, layers, host=host, port=port, channels=channels)
-        closing.callback(page.stop)
-        click.echo(f"open      {page.url}   (Ctrl-C ends)")
-        return page
-
-    with user_errors(), ExitStack() as closing:
-        try:
-            if request is None:
-                _view_demo(make_page, is_paused)
-            elif request.recording.suffix == ".npz" and request.recording.is_file():
-                _refuse_options(request)
-                _view_map(make_page, request.recording)
-            elif request.recording.is_file() and not is_bag(request.recording):
-                kinds = "a bag (.bag, .mcap, .db3), a folder of scans or a saved map (.npz)"
-                raise ValueError(f"{request.recording}: is of no kind that can be shown; give {kinds}")
-            else:
-                _view_recording(make_page, request, is_paused)
-        except KeyboardInterrupt:
-            click.echo("closed")
+    if request is None:
+        _view_demo(server, is_paused)
+    elif request.recording.suffix == ".npz" and request.recording.is_file():
+        _refuse_options(request)
+        _view_map(server, request.recording)
+    elif request.recording.is_file() and not is_bag(request.recording):
+        kinds = "a bag (.bag, .mcap, .db3), a folder of scans or a saved map (.npz)"
+        raise ValueError(f"{request.recording}: is of no kind that can be shown; give {kinds}")
+    else:
+        _view_recording(server, request, is_paused)
 
 
-def _view_recording(make_page: _MakePage, request: MapRequest, is_paused: bool) -> None:
+def _make_page(server: Any, layers: tuple[str, ...], channels: Mapping[str, ChannelConfig]) -> Page:
+    from torchelev.viz.live import Page
+
+    return Page("", layers, channels=channels, server=server)
+
+
+def _view_recording(server: Any, request: MapRequest, is_paused: bool) -> None:
     from torchelev.viz.live import Player
 
     with open_scans(request) as (scans, options):
         emap = new_map(load_config(request.config, request.resolution, request.size), request.device, options)
-        page = make_page(request.recording.resolve().name, emap.layers, emap.cfg.channels)
+        page = _make_page(server, emap.layers, emap.cfg.channels)
         player, show = Player(page, len(scans), not is_paused), ShowScans()
         stopped = fuse_all(MappingRun(emap), scans, options, between=lambda run, frame: show(player, run, frame))
         if stopped is not None and not isinstance(stopped, KeyboardInterrupt) and player.num_shown:
@@ -92,13 +83,13 @@ class ShowScans:
         player.show(take_snapshot(run.emap, base, pose, frame.points, layers=layers, time=self._time))
 
 
-def _view_demo(make_page: _MakePage, is_paused: bool) -> None:
+def _view_demo(server: Any, is_paused: bool) -> None:
     from torchelev.app.demo import DemoWalk
     from torchelev.viz.live import Player, take_snapshot
 
     demo = DemoWalk()
     emap = demo.emap
-    player = Player(make_page("demo", emap.layers, emap.cfg.channels), len(demo), not is_paused)
+    player = Player(_make_page(server, emap.layers, emap.cfg.channels), len(demo), not is_paused)
     for scan in demo:
         scene = scan.T_map_base, scan.T_map_sensor, scan.points
         player.show(take_snapshot(emap, *scene, layers=emap.layers, time=scan.time))
@@ -114,12 +105,12 @@ def _refuse_options(request: MapRequest) -> None:
         raise ValueError(f"{given}: only for recordings; {request.recording} is a map, which is shown as it is")
 
 
-def _view_map(make_page: _MakePage, path: Path) -> None:
+def _view_map(server: Any, path: Path) -> None:
     from torchelev.viz.channels import shown_channels
     from torchelev.viz.live import Snapshot
 
     saved = _read_map(path)
-    page = make_page(path.name, tuple(saved.layers), shown_channels(saved.config, saved.layers))
+    page = _make_page(server, tuple(saved.layers), shown_channels(saved.config, saved.layers))
     page.draw(Snapshot(saved), f"{saved.resolution:g} m cells, {' x '.join(map(str, _shape(saved)))}")
     page.wait()
 

@@ -11,7 +11,7 @@ from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
 from torchelev.channels.config import ChannelConfig, parse_channels
-from torchelev.viz.style import COLORS
+from torchelev.viz.palette import COLORS
 
 _FURTHER = "tab20"  #: colour map of the classes after the first ones
 

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from torchelev.viz.palette import ROBOT_COLOR, UNKNOWN_COLOR
 from torchelev.viz.picture import round_length
 from torchelev.viz.relief import draw_relief, relief_colors, rgb
-from torchelev.viz.style import ROBOT_COLOR, UNKNOWN_COLOR
 
 _FONT_FILE = Path(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf")
 _GREY = (90, 90, 90)

@@ -11,8 +11,8 @@ import numpy as np
 from torchelev.errors import require
 from torchelev.io.export import SavedMap, take
 from torchelev.viz.channels import channel_colors, class_legend, shown_channels
+from torchelev.viz.palette import DEVIATIONS, RATINGS
 from torchelev.viz.plot import Panel, save_layers
-from torchelev.viz.style import DEVIATIONS, RATINGS
 
 if TYPE_CHECKING:
     from torchelev.elevation_map import ElevationMap

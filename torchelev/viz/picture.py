@@ -17,8 +17,9 @@ from PIL import Image, ImageDraw, ImageFont
 
 from torchelev.errors import require, require_count, require_positive
 from torchelev.files.output_files import atomic_file
+from torchelev.viz.palette import HEIGHTS, UNKNOWN_COLOR
 from torchelev.viz.plot import Panel, color_limits
-from torchelev.viz.style import HEIGHTS, UNKNOWN_COLOR, png_info
+from torchelev.viz.style import png_info
 
 _FONT_FILE = Path(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf")
 _FONT_SIZE = 12  # [pixels], as all sizes here

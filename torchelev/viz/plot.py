@@ -21,7 +21,8 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from torchelev.files.output_files import atomic_file
-from torchelev.viz.style import HEIGHTS, ROBOT_COLOR, UNKNOWN_COLOR, small_png, styled
+from torchelev.viz.palette import HEIGHTS, ROBOT_COLOR, UNKNOWN_COLOR
+from torchelev.viz.style import small_png, styled
 
 
 @dataclass(frozen=True, kw_only=True)

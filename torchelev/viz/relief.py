@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
-from torchelev.viz.style import HEIGHTS, UNKNOWN_COLOR
+from torchelev.viz.palette import HEIGHTS, UNKNOWN_COLOR
 
 _AMBIENT = 0.5  # brightness where no light falls; flat ground has 1
 _BRIGHTEST = 1.25

@@ -19,7 +19,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchelev.traversability.net import TraversabilityNet
-from torchelev.viz.style import HEIGHTS, RATINGS, draw_cells, make_figure, styled, write
+from torchelev.viz.palette import HEIGHTS, RATINGS
+from torchelev.viz.style import draw_cells, make_figure, styled, write
 from training import RESULTS
 from training.options import paper_weights_option
 from training.traversability.heads import Score, baselines

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from benchmarks.quality.features.comparison import Outcome
 from benchmarks.quality.features.reading import GRID, Figures
-from torchelev.viz.style import HEIGHTS, ROBOT_COLOR, draw_cells, make_figure, styled, write
+from torchelev.viz.palette import HEIGHTS, ROBOT_COLOR
+from torchelev.viz.style import draw_cells, make_figure, styled, write
 
 
 class Row(NamedTuple):

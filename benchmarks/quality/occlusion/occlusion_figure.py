@@ -16,7 +16,8 @@ from benchmarks.quality.occlusion.walks import GRID
 from torchelev import ElevationMap
 from torchelev.planning.planner import Path
 from torchelev.planning.traversal_cost import traversal_cost
-from torchelev.viz.style import ROBOT_COLOR, draw_cells, make_figure, styled, write
+from torchelev.viz.palette import ROBOT_COLOR
+from torchelev.viz.style import draw_cells, make_figure, styled, write
 
 _SPAN = (-1.7, 2.6)  # [m] drawn range of x
 EYE = 0.8  # [m] height of the camera

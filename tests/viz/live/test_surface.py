@@ -28,6 +28,13 @@ def test_the_surface_has_a_hole_where_the_map_is_unknown():
     assert mesh.vertices[-1] == pytest.approx([0.25, 0.15, 0.5], abs=1e-6)
 
 
+def test_the_surface_is_matt():
+    """A material of metal, glTF's default, shows reflections of an environment, and the page has none."""
+    colors = np.full((6, 4, 4), 255, np.uint8)
+    mesh = trimesh.load(io.BytesIO(surface(ramp(), colors, np.zeros(3))), file_type="glb", force="mesh", process=False)
+    assert (mesh.visual.material.metallicFactor, mesh.visual.material.roughnessFactor) == (0, 1)
+
+
 def test_an_empty_map_has_no_surface():
     saved = ramp()
     saved.layers["elevation"][:] = np.nan

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,8 @@ import click
 from torchelev.app.commands.map import map_command
 from torchelev.app.mapping.map_request import MapRequest
 from torchelev.app.option_groups import GroupedCommand, GroupedOption
+from torchelev.app.user_error import user_errors
+from torchelev.viz.live.server import address_of, open_server, stop_server
 
 _VIEW_HELP = """Show a map in the browser while it grows.
 
@@ -30,10 +33,18 @@ the cell that is clicked. Ctrl-C closes it.
 
 def _run_view(recording: Path | None, host: str, port: int, paused: bool, **options: Any) -> None:
     """Run `torchelev view`; its help text is `_VIEW_HELP`."""
-    from torchelev.app.view_command import run_view
-
     request = None if recording is None else MapRequest(recording=recording, **options)
-    run_view(request, host, port, paused)
+    with user_errors(), ExitStack() as closing:
+        server = open_server("demo" if recording is None else recording.resolve().name, host, port)
+        closing.callback(stop_server, server)
+        if recording is None or recording.exists():  # else all that follows is an error
+            click.echo(f"open      {address_of(server)}   (Ctrl-C ends)")
+        try:
+            from torchelev.app.view_command import run_view  # imports torch, while browsers load the page
+
+            run_view(request, server, paused)
+        except KeyboardInterrupt:
+            click.echo("closed")
 
 
 _OUTPUTS = ("recording", "out", "grid_map", "video", "every")  # parameters of `map` that `view` lacks

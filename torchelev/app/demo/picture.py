@@ -46,8 +46,8 @@ def _label_landmarks(ax: Axes) -> None:
 
 def _make_panels(emap: ElevationMap, truth: Tensor) -> list[Panel]:
     """Return the panels of the picture; heights share one colour scale."""
+    from torchelev.viz.palette import DEVIATIONS, ERRORS, RATINGS
     from torchelev.viz.plot import Panel
-    from torchelev.viz.style import DEVIATIONS, ERRORS, RATINGS
 
     layers = {name: emap.layer(name)[0].double() for name in ("elevation", "variance", "traversability", "upper_bound")}
     deviation = (1e3 * layers["variance"].sqrt()).numpy()

@@ -12,8 +12,9 @@ from matplotlib.colors import LightSource, Normalize
 from numpy.typing import NDArray
 
 from torchelev.app.fleet.numbers import Comparison, FleetNumbers, count_robots
+from torchelev.viz.palette import ERRORS, HEIGHTS, UNKNOWN_COLOR
 from torchelev.viz.relief import draw_relief
-from torchelev.viz.style import ERRORS, HEIGHTS, UNKNOWN_COLOR, draw_cells, make_figure, styled, write
+from torchelev.viz.style import draw_cells, make_figure, styled, write
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from torchelev.channels.config import ChannelConfig
 from torchelev.viz.channels import channel_colors, class_legend
-from torchelev.viz.style import DEVIATIONS, HEIGHTS, RATINGS
+from torchelev.viz.palette import DEVIATIONS, HEIGHTS, RATINGS
 
 DEVIATION = "standard deviation"  #: shown in place of the variance
 _UNITS = {"elevation": "m", "upper_bound": "m", DEVIATION: "m", "time": "s", "ceiling": "m", "clearance": "m"}

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
-import logging
-import socket
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -15,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchelev.channels.config import ChannelConfig
-from torchelev.errors import require
 from torchelev.viz.channels import choose_channels
 from torchelev.viz.live.camera import Camera
 from torchelev.viz.live.colors import (
@@ -29,10 +24,10 @@ from torchelev.viz.live.colors import (
     shown_layers,
 )
 from torchelev.viz.live.scene import Scene
+from torchelev.viz.live.server import address_of, open_server, stop_server
 from torchelev.viz.live.snapshot import PARTS, Snapshot
 from torchelev.viz.live.surface import find_cell
 
-_MAX_PORT = 65535
 _CLICK_HINT = "Click a cell to read its values."
 
 
@@ -46,6 +41,7 @@ class Page:
         host: "127.0.0.1" lets only this machine connect, "0.0.0.0" every machine that reaches it.
         port: of the page. If it is taken, the next free one is used.
         channels: of the map; those of colours and classes whose components are among the layers can be chosen, too.
+        server: of `open_server`, which takes the place of title, host and port.
 
     Attributes:
         on_change: called, in a thread of the server, when the picture has to be drawn again.
@@ -63,15 +59,9 @@ class Page:
         host: str = "127.0.0.1",
         port: int = 8080,
         channels: Mapping[str, ChannelConfig] | None = None,
+        server: Any = None,
     ) -> None:
-        import viser
-
-        require(0 < port <= _MAX_PORT, "port", f"must lie in [1, {_MAX_PORT}]", port, "use 8080")
-        _require_own_address(host)
-        logging.getLogger("websockets.server").addFilter(_is_worth_logging)
-        with contextlib.redirect_stdout(io.StringIO()):  # its banner
-            self.server: Any = viser.ViserServer(host=host, port=port, label=title, verbose=False)
-        self.server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
+        self.server: Any = open_server(title, host, port) if server is None else server
         self.on_change: Callable[[], None] = lambda: None
         self._scene, self._camera = Scene(self.server), Camera(self.server)
         self._lock = threading.Lock()
@@ -86,8 +76,7 @@ class Page:
     @property
     def url(self) -> str:
         """The page's address."""
-        host = self.server.get_host()
-        return f"http://{'localhost' if host in ('127.0.0.1', '0.0.0.0') else host}:{self.server.get_port()}"
+        return address_of(self.server)
 
     @property
     def layer(self) -> str:
@@ -211,20 +200,4 @@ class Page:
 
     def stop(self) -> None:
         """Close the page."""
-        with contextlib.redirect_stdout(io.StringIO()):  # its farewell
-            self.server.stop()
-
-
-def _is_worth_logging(record: logging.LogRecord) -> bool:
-    """Return whether to log a server's message: browsers may connect in advance and then ask for nothing."""
-    return "handshake failed" not in record.getMessage()
-
-
-def _require_own_address(host: str) -> None:
-    """Refuse an address at which the server cannot listen."""
-    try:
-        with socket.create_server((host, 0)):
-            pass
-    except OSError as error:
-        actual, hint = f"{host!r} ({error.strerror})", "use 127.0.0.1, or 0.0.0.0 to let other machines connect"
-        raise ValueError(f"host: must be an address of this machine, got {actual}; {hint}") from error
+        stop_server(self.server)

@@ -26,8 +26,16 @@ def surface(saved: SavedMap, colors: NDArray[np.uint8], origin: NDArray[np.float
         return b""
     linear = _LINEAR[colors[np.isfinite(heights)]]  # glTF has linear colours
     mesh = trimesh.Trimesh(vertices - origin, triangles, vertex_colors=linear, process=False)
-    glb: Any = mesh.export(file_type="glb")
+    glb: Any = mesh.export(file_type="glb", tree_postprocessor=_make_matt)
     return glb
+
+
+def _make_matt(tree: dict[str, Any]) -> None:
+    """Give the meshes of a glTF file a matt material; without one they are of metal, which shows only reflections."""
+    tree["materials"] = [{"pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1}}]
+    for mesh in tree["meshes"]:
+        for part in mesh["primitives"]:
+            part["material"] = 0
 
 
 _SRGB = np.arange(256) / 255
