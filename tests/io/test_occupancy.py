@@ -5,7 +5,11 @@ import pytest
 import torch
 
 from tests.helpers import small_map
+from tests.levels.walks import line, make_map, walk
+from torchelev import LevelsConfig
 from torchelev.io.occupancy import to_occupancy_grid
+from torchelev.planning.traversal_cost import TraversalCostConfig, traversal_cost
+from torchelev.sim.exact import covered_scenes
 
 
 def rated(values, corner=(0, 0)):
@@ -35,3 +39,24 @@ def test_the_threshold():
     for wrong in (-0.1, 1.0):
         with pytest.raises(ValueError, match="min_traversability: must be at least 0 and less than 1"):
             to_occupancy_grid(rated(values), min_traversability=wrong)
+
+
+def test_cells_below_low_ceilings_are_lethal_where_the_planner_does_not_go():
+    emap = make_map()
+    walk(emap, covered_scenes.table(), line((-1.5, 0.0, 0.0), (0.5, 0.0, 0.0), 5))
+    clearance = emap.layer("clearance")[0].numpy()
+    for height, lowest in ((None, 0.4), (0.3, 0.4), (0.9, 0.9)):
+        costs = to_occupancy_grid(emap, height=height).data.reshape(clearance.shape[::-1]).T
+        low = clearance < lowest - 1e-3
+        assert (costs[low] == 100).all() and (low.any() or lowest == 0.4)
+        rated = to_occupancy_grid(emap).data.reshape(clearance.shape[::-1]).T
+        assert np.array_equal(costs[~low], rated[~low])
+        impassable = traversal_cost(emap, TraversalCostConfig(height=height))[0].isinf().numpy()
+        assert impassable[low].all()
+
+
+def test_a_height_needs_levels():
+    for emap in (rated([[0.9]]), make_map(levels=LevelsConfig(max_levels=1))):
+        assert to_occupancy_grid(emap) is not None
+        with pytest.raises(ValueError, match="height: needs a map with levels"):
+            to_occupancy_grid(emap, height=0.5)

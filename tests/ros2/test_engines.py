@@ -67,9 +67,22 @@ def test_both_publish_ground_ceiling_and_clearance(library):
             engine.update(SensorInput(points[0].numpy(), T_map_sensor[0].numpy(), T_map_base[0].numpy(), 0.2))
         maps.append(from_grid_map(outputs.grid_map(engine, layers)).layers)
         assert outputs.map_cloud(engine, layers).names == ["x", "y", "z", *CEILINGS]
+        clearance = engine.layer("clearance")
+        costs = outputs.costmap(engine, 0.5, 2.5).data.reshape(clearance.shape[::-1]).T
+        assert (costs[clearance < 2.49] == 100).all() and (clearance < 2.49).any()
+        assert np.array_equal(outputs.costmap(engine, 0.5, 0.0).data, outputs.costmap(engine, 0.5).data)
     for name in layers:
         np.testing.assert_allclose(maps[0][name], maps[1][name], rtol=0, atol=2e-5, err_msg=name)
     assert np.nanmedian(maps[1]["ceiling"]) == pytest.approx(12 * covered_scenes.RISE - 0.25, abs=0.02)
+
+
+@pytest.mark.parametrize("kind", ["torch", "library"])
+@pytest.mark.parametrize("levels", [{}, {"levels": {"max_levels": 1}}])
+def test_a_robots_height_needs_ceilings(library, kind, levels):
+    cfg = {"grid": {"length_x": 2.0, "length_y": 2.0}, **levels}
+    assert make_engine(cfg, NodeSettings(engine=kind, library=library)).levels is None
+    with pytest.raises(ValueError, match="robot_height: needs a map with levels"):
+        make_engine(cfg, NodeSettings(engine=kind, library=library, robot_height=0.6))
 
 
 def test_pytorchs_diagnosis_runs_beside_updates(library, monkeypatch):

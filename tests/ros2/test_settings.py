@@ -59,6 +59,7 @@ def test_an_empty_file_is_all_defaults(tmp_path):
         ({"threads": 1.5}, "threads: must be a whole number, got 1.5"),
         ({"threads": 0}, "threads: must be at least 1, got 0"),
         ({"min_traversability": 1.0}, r"min_traversability: must lie in \[0, 1\), got 1.0"),
+        ({"robot_height": -0.5}, r"robot_height: must lie in \[0, 20\] m, got -0.5"),
         ({"engine": "cuda"}, "engine: must be one of auto, torch, library, got 'cuda'"),
     ],
 )

@@ -34,26 +34,36 @@ class OccupancyGrid(NamedTuple):
     data: NDArray[np.int8]  #: (W * H,), x fastest: -1 unknown, 0 free to 100 lethal
 
 
-def to_occupancy_grid(emap: ElevationMap, env: int = 0, min_traversability: float = 0.5) -> OccupancyGrid:
+def to_occupancy_grid(
+    emap: ElevationMap, env: int = 0, min_traversability: float = 0.5, height: float | None = None
+) -> OccupancyGrid:
     """Turn the traversability t of one environment into the costs of Nav2's costmaps.
 
     Below `min_traversability` a cell is lethal, 100. Above, its cost falls from 98 to 0, 98 (1 - t) / (1 - min). 99,
-    Nav2's inscribed obstacle, is left to its inflation layer. Cells that are not rated are unknown, -1.
+    Nav2's inscribed obstacle, is left to its inflation layer. Cells that are not rated are unknown, -1. On maps with
+    levels, cells below a ceiling that is too low for the robot are lethal, whatever their rating.
 
     Args:
         emap: the map.
         env: the environment.
         min_traversability: t below which the robot must not stand, from 0 to less than 1.
+        height: of the robot [m], on maps with levels; None: their `min_gap`, and at least that.
 
     Raises:
-        ValueError: the environment does not exist, or `min_traversability` is out of range.
+        ValueError: the environment does not exist, `min_traversability` is out of range, or a height is given for a
+            map without levels.
     """
     from torchelev.io.export import take  # which needs PyTorch
 
     require_threshold(min_traversability)
-    taken = take(emap, env, ("traversability",))
+    levels = None if emap.levels is None else emap.cfg.levels
+    hint = "give the map levels=LevelsConfig(), or leave it out"
+    fits = height is None or levels is not None
+    require(fits, "height", "needs a map with levels, which knows ceilings", height, hint)
+    taken = take(emap, env, ("traversability",) if levels is None else ("traversability", "clearance"))
     x_min, _, y_min, _ = taken.extent
-    return occupancy_of(taken.layers["traversability"], (x_min, y_min), taken.resolution, min_traversability)
+    low = None if levels is None else levels.is_too_low(taken.layers["clearance"], height)
+    return occupancy_of(taken.layers["traversability"], (x_min, y_min), taken.resolution, min_traversability, low)
 
 
 def require_threshold(min_traversability: float) -> None:
@@ -63,7 +73,11 @@ def require_threshold(min_traversability: float) -> None:
 
 
 def occupancy_of(
-    traversability: NDArray, corner: Sequence[float], resolution: float, min_traversability: float = 0.5
+    traversability: NDArray,
+    corner: Sequence[float],
+    resolution: float,
+    min_traversability: float = 0.5,
+    is_too_low: NDArray[np.bool_] | None = None,
 ) -> OccupancyGrid:
     """Return the costs of a layer (H, W), NaN where not rated: `to_occupancy_grid`.
 
@@ -72,10 +86,12 @@ def occupancy_of(
         corner: x, y [m] of the window's corner with the smallest coordinates.
         resolution: [m] of a cell.
         min_traversability: below which the robot must not stand.
+        is_too_low: (H, W) where the robot does not fit below a ceiling; None: nowhere.
     """
     t = traversability
     cost = np.round(_HIGHEST * (1 - t) / (1 - min_traversability))
     cost = np.where(t < min_traversability, LETHAL, cost)
-    data = np.where(np.isnan(t), UNKNOWN, cost).astype(np.int8)
+    cost = np.where(np.isnan(t), UNKNOWN, cost)
+    data = (cost if is_too_low is None else np.where(is_too_low, LETHAL, cost)).astype(np.int8)
     info = MapMetaData(resolution, t.shape[0], t.shape[1], Pose(Point(float(corner[0]), float(corner[1]))))
     return OccupancyGrid(info, np.ascontiguousarray(data.T).ravel())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from torchelev.errors import require, require_positive
 
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 MAX_LEVELS = 8  # a cell of more is a bush
 MAX_HEIGHT = 20.0  # [m] of a gap or a step; more is a number in other units
 SEPARATIONS = ("rays", "gap")
+ROUNDING = 1e-3  # [m] by which a ceiling may be too low
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +50,14 @@ class LevelsConfig:
             value = getattr(self, name)
             good = 0 <= value < math.inf
             require(good, f"levels.{name}", "must be finite and not negative", value, "leave it out for the default")
+
+    def needed_height(self, height: float | None) -> float:
+        """Return the clearance [m] that a robot of a height needs; None: of `min_gap`, as smaller gaps are solid."""
+        return max(self.min_gap, 0.0 if height is None else height)
+
+    def is_too_low(self, clearance: Any, height: float | None) -> Any:
+        """Return where a clearance [m], a tensor or an array, is less than `needed_height`; NaN is not."""
+        return clearance < self.needed_height(height) - ROUNDING
 
     def blind_cells(self, grid: GridConfig) -> int:
         """Return `max_blind` in cells."""

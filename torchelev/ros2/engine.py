@@ -9,6 +9,8 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from torchelev.levels.config import LevelsConfig
+
 
 class Window(NamedTuple):
     """Where a map's cells lie."""
@@ -49,6 +51,7 @@ class Engine(Protocol):
     """What a node asks of a map."""
 
     links: list[str]  #: names of the links of the robot's body, whose poses updates take
+    levels: LevelsConfig | None  #: of a map that knows ceilings
 
     def update(self, given: SensorInput) -> None:
         """Fuse the points of one sensor."""
@@ -96,6 +99,11 @@ class Engine(Protocol):
 
     def load(self, path: Path) -> None:
         """Load a map that was saved; ValueError or OSError if this fails, and the map is as it was."""
+
+
+def levels_with_ceilings(levels: LevelsConfig | None) -> LevelsConfig | None:
+    """Return the levels of a map, None if it knows only the ground."""
+    return None if levels is None or levels.max_levels == 1 else levels
 
 
 def thinned(points: NDArray, max_points: int) -> NDArray:

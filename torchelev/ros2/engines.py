@@ -27,5 +27,10 @@ def make_engine(cfg: dict[str, Any], settings: NodeSettings) -> Engine:
         require(has_torch, "engine", "must be installed", "no PyTorch", hint)
         from torchelev.ros2.torch_engine import TorchEngine
 
-        return TorchEngine(cfg, settings)
-    return LibraryEngine(cfg, settings)
+        engine: Engine = TorchEngine(cfg, settings)
+    else:
+        engine = LibraryEngine(cfg, settings)
+    fits = not settings.robot_height or engine.levels is not None
+    hint = "set map.levels.max_levels to 3, or leave robot_height out"
+    require(fits, "robot_height", "needs a map with levels, which knows ceilings", settings.robot_height, hint)
+    return engine

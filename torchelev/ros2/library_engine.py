@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from torchelev.errors import require
 from torchelev.files.config_files import to_json
-from torchelev.ros2.engine import PathAnswer, SensorInput, Window
+from torchelev.levels.config import LevelsConfig
+from torchelev.ros2.engine import PathAnswer, SensorInput, Window, levels_with_ceilings
 from torchelev.ros2.settings import NodeSettings
 
 _NEEDS_TORCH = "{}: needs PyTorch, and the node's engine is the C library; install torch, or set engine to torch"
@@ -49,6 +50,8 @@ class LibraryEngine:
         except ValueError as error:  # it calls the parameter a layout
             raise ValueError(f"height_scan: {str(error).partition(': ')[2]}") from error
         self.links = self._map.links
+        levels = cfg.get("levels")
+        self.levels = levels_with_ceilings(None if levels is None else LevelsConfig(**levels))
 
     def update(self, given: SensorInput) -> None:
         """Fuse the points of one sensor."""

@@ -142,10 +142,11 @@ def _from_z(axis: NDArray[np.float64]) -> NDArray[np.float64]:
     return quat / np.linalg.norm(quat)
 
 
-def costmap(engine: Engine, min_traversability: float) -> OccupancyGrid:
-    """Return the costs of the map at Nav2's scale."""
-    window = engine.window()
-    return occupancy_of(engine.layer("traversability"), window.corner, window.resolution, min_traversability)
+def costmap(engine: Engine, min_traversability: float, robot_height: float | None = None) -> OccupancyGrid:
+    """Return the costs of the map at Nav2's scale, for a robot of a height [m]: `to_occupancy_grid`."""
+    window, rating, levels = engine.window(), engine.layer("traversability"), engine.levels
+    low = None if levels is None else levels.is_too_low(engine.layer("clearance"), robot_height)
+    return occupancy_of(rating, window.corner, window.resolution, min_traversability, low)
 
 
 def map_cloud(engine: Engine, layers: Sequence[str]) -> MapCloud:

@@ -90,7 +90,8 @@ class Publishers:
         return messages.to_cloud(outputs.map_cloud(self._node.engine, self._node.settings.layers), self._header())
 
     def _make_costmap(self) -> OccupancyGrid:
-        grid = outputs.costmap(self._node.engine, self._node.settings.min_traversability)
+        settings = self._node.settings
+        grid = outputs.costmap(self._node.engine, settings.min_traversability, settings.robot_height)
         return messages.to_occupancy_grid(grid, self._header())
 
     def _make_scan(self) -> Float32MultiArray | None:

@@ -13,6 +13,7 @@ from typing import Any
 
 from torchelev.errors import require, require_positive
 from torchelev.files.config_files import read_settings
+from torchelev.levels.config import MAX_HEIGHT
 
 _KINDS = {str: "text", float: "a number", int: "a whole number", bool: "true or false"}
 _OF_ROS = ("use_sim_time", "qos_overrides", "start_type_description_service")  # parameters that rclpy declares
@@ -56,6 +57,9 @@ class NodeSettings:
         True,
     )
     min_traversability: float = _setting(0.5, "in [0, 1): below it a cell of ~/costmap is lethal", True)
+    robot_height: float = _setting(
+        0.0, "[m] on maps with levels, ~/costmap and ~/check_path close spaces below lower ceilings; 0: their min_gap"
+    )
     height_scan: str = _setting("isaac_lab", "layout of ~/height_scan: isaac_lab, mjlab, legged_gym, or one as JSON")
     map_file: str = _setting(
         "map.safetensors", "file of ~/save_map and ~/load_map, from the folder of the start on", True
@@ -88,6 +92,9 @@ class NodeSettings:
         require(self.engine in ENGINES, "engine", f"must be one of {', '.join(ENGINES)}", repr(self.engine), "use auto")
         for name in ("depth_scale", "foot_height"):
             require(math.isfinite(getattr(self, name)), name, "must be finite", getattr(self, name), "see its default")
+        height_fits = 0 <= self.robot_height <= MAX_HEIGHT
+        rule = f"must lie in [0, {MAX_HEIGHT:g}] m"
+        require(height_fits, "robot_height", rule, self.robot_height, "give metres; 0: min_gap of the levels")
         require(self.depth_scale >= 0, "depth_scale", "must not be negative", self.depth_scale, "0.001 for millimetres")
         require_positive(clear_radius=self.clear_radius)
         is_method = self.initialize_method in _METHODS

@@ -22,7 +22,7 @@ from torchelev.errors import require
 from torchelev.io.map_file import load_map, save_map
 from torchelev.observations.height_scan import HeightScan
 from torchelev.observations.scan.presets import PRESETS
-from torchelev.ros2.engine import PathAnswer, SensorInput, Window
+from torchelev.ros2.engine import PathAnswer, SensorInput, Window, levels_with_ceilings
 from torchelev.ros2.settings import NodeSettings
 from torchelev.state import map_layers
 
@@ -60,6 +60,8 @@ class TorchEngine:
         self._scan = _scan_of(settings.height_scan)
         self._diagnosis = Diagnosis()
         self.links = list(self._map.cfg.sensor.links)
+        self.levels = levels_with_ceilings(self._map.cfg.levels)
+        self._height = settings.robot_height or None
 
     def update(self, given: SensorInput) -> None:
         """Fuse the points of one sensor."""
@@ -112,7 +114,7 @@ class TorchEngine:
         standing = torch.full((1, len(footprint), 2), torch.nan, dtype=torch.float64)  # it is not known where it stands
         if T_map_base is not None:
             standing = place_footprint(self._map, corners, _floats(T_map_base)[:, None])[:, 0]
-        cfg = FootprintConfig(max_extent=2.01 * float(np.hypot(*footprint.T).max()))
+        cfg = FootprintConfig(max_extent=2.01 * float(np.hypot(*footprint.T).max()), height=self._height)
         path = _floats(poses)
         samples = count_samples(self._map, path, corners)
         hint, rule = (

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
-from torchelev.planning.limits import ROUNDING
+from torchelev.levels.config import ROUNDING
 from torchelev.planning.polygons import PolygonCells
 from torchelev.planning.terrain.ground import read_patches
 from torchelev.state import MapState
@@ -29,11 +29,12 @@ def too_low(emap: ElevationMap, height: float | None, state: MapState | None = N
     Raises:
         ValueError: if a height is given for a map without levels.
     """
-    needed = needed_height(emap, height)
+    needed_height(emap, height)
     if emap.levels is None:
         return None
+    assert emap.cfg.levels is not None
     clearance, known = emap.read_layer("clearance", state)
-    return known & (clearance < needed - ROUNDING)
+    return known & emap.cfg.levels.is_too_low(clearance, height)
 
 
 def needed_height(emap: ElevationMap, height: float | None) -> float:
@@ -53,7 +54,7 @@ def needed_height(emap: ElevationMap, height: float | None) -> float:
         require(height is None, "height", "needs a map with levels, which knows ceilings", height, hint)
         return 0.0
     assert emap.cfg.levels is not None
-    return max(emap.cfg.levels.min_gap, 0.0 if height is None else height)
+    return emap.cfg.levels.needed_height(height)
 
 
 def describe_ceiling(ceiling: float, needed: float) -> list[str]:
