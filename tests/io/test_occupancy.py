@@ -12,10 +12,10 @@ from torchelev.planning.traversal_cost import TraversalCostConfig, traversal_cos
 from torchelev.sim.exact import covered_scenes
 
 
-def rated(values, corner=(0, 0)):
+def rated(values, corner=(0, 0), **settings):
     """A map with these traversabilities (H, W), NaN where not rated."""
     values = torch.tensor(values)
-    emap = small_map(cells=tuple(values.shape), resolution=0.5)
+    emap = small_map(cells=tuple(values.shape), resolution=0.5, **settings)
     known = torch.isfinite(values)[None]
     ratings = torch.where(known, values[None], 0.0)
     emap.load_state(
@@ -60,3 +60,21 @@ def test_a_height_needs_levels():
         assert to_occupancy_grid(emap) is not None
         with pytest.raises(ValueError, match="height: needs a map with levels"):
             to_occupancy_grid(emap, height=0.5)
+
+
+def test_spaces_that_are_too_low_are_lethal_as_in_planning():
+    """Infinite: nothing hangs there; NaN: nobody looked. Half a millimetre is rounding."""
+    ceilings = torch.tensor([[0.3, 0.398, 0.3995, 1.0], [torch.inf, torch.nan, 0.3, torch.nan]])
+    ratings = [[1.0, 0.75, 1.0, 1.0], [1.0, 1.0, torch.nan, torch.nan]]
+    emap = rated(ratings, levels=LevelsConfig(min_gap=0.4))
+    emap.load_state(emap.state._replace(validity=torch.ones_like(emap.validity)))  # but for the ratings, all is known
+    levels = emap.levels.in_windows(emap.state)
+    lower, support, top = (torch.zeros_like(values) for values in (levels.lower, levels.support, levels.free_top))
+    lower[:, 0], support[:, 0] = ceilings.nan_to_num(0.0, 0.0), 10.0 * ceilings.isfinite()
+    top[:] = 10.0 * ceilings.isinf()
+    emap.load_state(emap.state, levels._replace(lower=lower, upper=lower, support=support, free_top=top))
+    np.testing.assert_array_equal(emap.layer("clearance")[0], ceilings)
+    costs = to_occupancy_grid(emap).data.reshape(4, 2).T
+    assert costs.tolist() == [[100, 100, 0, 0], [0, 0, 100, -1]]
+    is_closed = torch.isinf(traversal_cost(emap, TraversalCostConfig(inflation_radius=0.0)))[0].numpy()
+    assert np.array_equal(is_closed, costs == 100)

@@ -76,6 +76,32 @@ def test_both_publish_ground_ceiling_and_clearance(library):
     assert np.nanmedian(maps[1]["ceiling"]) == pytest.approx(12 * covered_scenes.RISE - 0.25, abs=0.02)
 
 
+def flat(low, high, height):
+    """Points of a horizontal surface at low < x < high."""
+    x, y = np.mgrid[low:high:0.02, -1.0:1.0:0.02] + 0.01
+    return np.stack([x, y, np.full_like(x, height)], -1).reshape(-1, 3).astype(np.float32)
+
+
+@pytest.mark.parametrize("kind", ["torch", "library"])
+def test_the_costmap_is_lethal_where_a_ceiling_is_too_low(library, kind):
+    """A board at 0.5 m sags to 0.3 m; elsewhere nobody looked up."""
+    levels = {"min_gap": 0.4, "separation": "gap"}
+    cfg = CFG | {"raycast": None, "sensor": {"exclusion": None}, "levels": levels}
+    cfg["grid"] = {"resolution": 0.1, "length_x": 4.0, "length_y": 3.0}
+    engine, T = make_engine(cfg, NodeSettings(engine=kind, library=library)), np.eye(4)
+    T[2, 3] = 0.45
+    for points in (np.concatenate([flat(-1.0, 1.0, 0.0), flat(0.0, 0.5, 0.5)]), flat(0.0, 0.5, 0.3)):
+        engine.update(SensorInput(points - T[:3, 3].astype(np.float32), T, T, 0.2))
+    clearance, t = engine.layer("clearance"), engine.layer("traversability")
+    is_low = np.abs(clearance - 0.3) < 0.01
+    assert is_low.sum() == np.isfinite(clearance).sum() == 5 * 20 and (t[is_low] > 0.9).all()
+    grid = outputs.costmap(engine, 0.5)
+    expected = np.where(is_low, 100, np.where(np.isnan(t), -1, 0))
+    assert grid.data.reshape(30, 40).T.tolist() == expected.tolist() and (expected == 0).sum() > 250
+    if kind == "torch":
+        assert np.array_equal(grid.data, to_occupancy_grid(engine._map).data)
+
+
 @pytest.mark.parametrize("kind", ["torch", "library"])
 @pytest.mark.parametrize("levels", [{}, {"levels": {"max_levels": 1}}])
 def test_a_robots_height_needs_ceilings(library, kind, levels):
@@ -177,7 +203,7 @@ from torchelev.ros2 import outputs, sensors
 from torchelev.ros2.engine import SensorInput
 from torchelev.ros2.engines import make_engine
 from torchelev.ros2.settings import NodeSettings
-engine = make_engine({}, NodeSettings(library=sys.argv[1]))
+engine = make_engine({"levels": {}}, NodeSettings(library=sys.argv[1]))
 engine.update(SensorInput(np.zeros((9, 3), np.float32) - 1, np.eye(4), np.eye(4), 0.0))
 outputs.grid_map(engine, ["elevation"]), outputs.costmap(engine, 0.5), outputs.map_cloud(engine, ["elevation"])
 import torchelev.io.bags.point_cloud, torchelev.app.cli, torchelev.app.ros2_command, torchelev.frames.quaternions
