@@ -170,7 +170,7 @@ class MapSight(BlindSight):
         estimated = self.pose_errors(T_map_base, dt)
         self.T_estimated.copy_(torch.where(mask[:, None, None], estimated, self.T_estimated))
         points, T_map_sensor = self.look(T_map_base, tile_ids)
-        points = points.masked_fill(~mask[:, None, None, None], torch.nan)
+        points.masked_fill_(~mask[:, None, None, None], torch.nan)
         self.emap.update(points, T_map_sensor, self.T_estimated, dt)
 
     def look(self, T_map_base: Tensor, tile_ids: Tensor) -> tuple[Tensor, Tensor]:

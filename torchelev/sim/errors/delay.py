@@ -65,7 +65,7 @@ class Delay(nn.Module):
             self.slot.add_(1).remainder_(self.max_latency + 1)
             self.age.add_(1)
         env = torch.arange(len(slot), device=slot.device)
-        delayed = clouds[slot, env].masked_fill(~is_stored[:, None, None], float("nan"))
+        delayed = clouds[slot, env].masked_fill_(~is_stored[:, None, None], float("nan"))
         return Cloud(delayed, torch.where(is_stored[:, None, None], poses[slot, env], T_map_sensor))
 
     def get_extra_state(self) -> dict[str, Tensor | None]:
