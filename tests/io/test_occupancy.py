@@ -49,8 +49,8 @@ def test_cells_below_low_ceilings_are_lethal_where_the_planner_does_not_go():
         costs = to_occupancy_grid(emap, height=height).data.reshape(clearance.shape[::-1]).T
         low = clearance < lowest - 1e-3
         assert (costs[low] == 100).all() and (low.any() or lowest == 0.4)
-        rated = to_occupancy_grid(emap).data.reshape(clearance.shape[::-1]).T
-        assert np.array_equal(costs[~low], rated[~low])
+        by_default = to_occupancy_grid(emap).data.reshape(clearance.shape[::-1]).T
+        assert np.array_equal(costs[~low], by_default[~low])
         impassable = traversal_cost(emap, TraversalCostConfig(height=height))[0].isinf().numpy()
         assert impassable[low].all()
 

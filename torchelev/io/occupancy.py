@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from torchelev.errors import require
 from torchelev.io.grid_map import Point, Pose
+from torchelev.levels.config import is_too_low, needed_height
 
 if TYPE_CHECKING:
     from torchelev.elevation_map import ElevationMap
@@ -56,13 +57,10 @@ def to_occupancy_grid(
     from torchelev.io.export import take  # which needs PyTorch
 
     require_threshold(min_traversability)
-    levels = None if emap.levels is None else emap.cfg.levels
-    hint = "give the map levels=LevelsConfig(), or leave it out"
-    fits = height is None or levels is not None
-    require(fits, "height", "needs a map with levels, which knows ceilings", height, hint)
-    taken = take(emap, env, ("traversability",) if levels is None else ("traversability", "clearance"))
+    needed = needed_height(emap.cfg.levels, height)
+    taken = take(emap, env, ("traversability",) if emap.levels is None else ("traversability", "clearance"))
     x_min, _, y_min, _ = taken.extent
-    low = None if levels is None else levels.is_too_low(taken.layers["clearance"], height)
+    low = None if emap.levels is None else is_too_low(taken.layers["clearance"], needed)
     return occupancy_of(taken.layers["traversability"], (x_min, y_min), taken.resolution, min_traversability, low)
 
 
@@ -77,7 +75,7 @@ def occupancy_of(
     corner: Sequence[float],
     resolution: float,
     min_traversability: float = 0.5,
-    is_too_low: NDArray[np.bool_] | None = None,
+    too_low: NDArray[np.bool_] | None = None,
 ) -> OccupancyGrid:
     """Return the costs of a layer (H, W), NaN where not rated: `to_occupancy_grid`.
 
@@ -86,12 +84,12 @@ def occupancy_of(
         corner: x, y [m] of the window's corner with the smallest coordinates.
         resolution: [m] of a cell.
         min_traversability: below which the robot must not stand.
-        is_too_low: (H, W) where the robot does not fit below a ceiling; None: nowhere.
+        too_low: (H, W) where the robot does not fit below a ceiling; None: nowhere.
     """
     t = traversability
     cost = np.round(_HIGHEST * (1 - t) / (1 - min_traversability))
     cost = np.where(t < min_traversability, LETHAL, cost)
     cost = np.where(np.isnan(t), UNKNOWN, cost)
-    data = (cost if is_too_low is None else np.where(is_too_low, LETHAL, cost)).astype(np.int8)
+    data = (cost if too_low is None else np.where(too_low, LETHAL, cost)).astype(np.int8)
     info = MapMetaData(resolution, t.shape[0], t.shape[1], Pose(Point(float(corner[0]), float(corner[1]))))
     return OccupancyGrid(info, np.ascontiguousarray(data.T).ravel())

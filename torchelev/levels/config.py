@@ -51,14 +51,6 @@ class LevelsConfig:
             good = 0 <= value < math.inf
             require(good, f"levels.{name}", "must be finite and not negative", value, "leave it out for the default")
 
-    def needed_height(self, height: float | None) -> float:
-        """Return the clearance [m] that a robot of a height needs; None: of `min_gap`, as smaller gaps are solid."""
-        return max(self.min_gap, 0.0 if height is None else height)
-
-    def is_too_low(self, clearance: Any, height: float | None) -> Any:
-        """Return where a clearance [m], a tensor or an array, is less than `needed_height`; NaN is not."""
-        return clearance < self.needed_height(height) - ROUNDING
-
     def blind_cells(self, grid: GridConfig) -> int:
         """Return `max_blind` in cells."""
         return int(min(self.max_blind, 1e3) / grid.resolution)
@@ -72,3 +64,33 @@ class LevelsConfig:
     def others(self) -> int:
         """How many surfaces a cell holds besides the ground, L = K - 1."""
         return self.max_levels - 1
+
+
+def levels_with_ceilings(levels: LevelsConfig | None) -> LevelsConfig | None:
+    """Return the levels of a map, None if it knows only the ground."""
+    return levels if levels is not None and levels.others else None
+
+
+def needed_height(levels: LevelsConfig | None, height: float | None) -> float:
+    """Return the clearance [m] that the robot needs below ceilings: its height, and at least `min_gap`.
+
+    The map treats a smaller gap as solid, whether or not it was seen. 0 of a map that knows only the ground.
+
+    Args:
+        levels: of the map.
+        height: of the robot [m]; None: `min_gap` of the levels.
+
+    Raises:
+        ValueError: if a height is given for a map that knows only the ground.
+    """
+    known = levels_with_ceilings(levels)
+    if known is None:
+        hint = "give the map levels=LevelsConfig(), or leave it out"
+        require(height is None, "height", "needs a map with levels, which knows ceilings", height, hint)
+        return 0.0
+    return max(known.min_gap, 0.0 if height is None else height)
+
+
+def is_too_low(clearance: Any, needed: float) -> Any:
+    """Return where a clearance [m], a number, tensor or array, is less than `needed_height`; NaN is not."""
+    return clearance < needed - ROUNDING

@@ -12,9 +12,10 @@ from torch import Tensor
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, require_positive
 from torchelev.inputs.checks import given_or_default
+from torchelev.levels.config import is_too_low, needed_height
 from torchelev.planning.limits import ROUNDING, Limit, first_limit, limits_of
 from torchelev.planning.polygons import convex_hull
-from torchelev.planning.terrain.ceilings import lowest_ceiling, needed_height
+from torchelev.planning.terrain.ceilings import lowest_ceiling
 from torchelev.planning.terrain.ground import fit_below, read_ground
 from torchelev.state import MapState
 
@@ -121,7 +122,10 @@ def check_footprint(
     has_few_bad_cells = (unsafe_fraction <= cfg.max_unsafe) & (unknown_fraction <= cfg.max_unknown)
     has_good_mean = torch.where(known > 0, mean >= cfg.min_traversability, assumed > 0)
     ground_values = (ground.steps.flatten(-2).amax(-1), *fit_below(ground, emap.cfg.grid.resolution))
-    beyond = (*limits_of(emap.cfg).exceeded(*ground_values), ceiling < needed_height(emap, cfg.height) - ROUNDING)
+    beyond = (
+        *limits_of(emap.cfg).exceeded(*ground_values),
+        is_too_low(ceiling, needed_height(emap.cfg.levels, cfg.height)),
+    )
     limit = first_limit(dict(zip((Limit.STEP, Limit.SLOPE, Limit.CLEARANCE, Limit.CEILING), beyond, strict=True)))
     safe = has_few_bad_cells & has_good_mean & (limit == Limit.NONE)
     step, slope, clearance, above = (value.to(mean.dtype) for value in (*ground_values, ceiling))

@@ -11,11 +11,12 @@ from torch import Tensor
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require, require_count
 from torchelev.inputs.checks import given_or_default
+from torchelev.levels.config import needed_height
 from torchelev.ops.transforms import is_readable
 from torchelev.planning.footprint import FootprintCheck, FootprintConfig, check_footprint
 from torchelev.planning.limits import Limits, limits_of
 from torchelev.planning.standing import MAX_CELL_OFFSET, check_polygon, check_poses, transform_polygon
-from torchelev.planning.terrain.ceilings import describe_ceiling, needed_height
+from torchelev.planning.terrain.ceilings import describe_ceiling
 from torchelev.state import MapState
 
 if TYPE_CHECKING:
@@ -111,7 +112,7 @@ def check_path(
     is_close = (step <= 1 + ROUNDING).repeat_interleave(samples, 1)
     safe = footprints.safe & torch.cat([is_close.new_ones(len(is_close), 1), is_close], 1)
     first_unsafe = _find_first_unsafe(safe, samples)
-    footprints, height = footprints._replace(safe=safe), needed_height(emap, cfg.height)
+    footprints, height = footprints._replace(safe=safe), needed_height(emap.cfg.levels, cfg.height)
     return PathCheck(safe.all(1), first_unsafe, places, footprints, limits_of(emap.cfg), height)
 
 

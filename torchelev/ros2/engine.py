@@ -101,11 +101,6 @@ class Engine(Protocol):
         """Load a map that was saved; ValueError or OSError if this fails, and the map is as it was."""
 
 
-def levels_with_ceilings(levels: LevelsConfig | None) -> LevelsConfig | None:
-    """Return the levels of a map, None if it knows only the ground."""
-    return None if levels is None or levels.max_levels == 1 else levels
-
-
 def thinned(points: NDArray, max_points: int) -> NDArray:
     """Return every k-th point, so that there are at most so many."""
     return points[:: max(1, math.ceil(len(points) / max_points))]

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from torchelev.errors import require
 from torchelev.files.config_files import to_json
-from torchelev.levels.config import LevelsConfig
-from torchelev.ros2.engine import PathAnswer, SensorInput, Window, levels_with_ceilings
+from torchelev.levels.config import LevelsConfig, levels_with_ceilings
+from torchelev.ros2.engine import PathAnswer, SensorInput, Window
 from torchelev.ros2.settings import NodeSettings
 
 _NEEDS_TORCH = "{}: needs PyTorch, and the node's engine is the C library; install torch, or set engine to torch"

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from torchelev.io.grid_map import GridMap, grid_map_of
 from torchelev.io.occupancy import OccupancyGrid, occupancy_of
+from torchelev.levels.config import is_too_low, needed_height
 from torchelev.robot_body.shapes import Box, Capsule
 from torchelev.ros2.engine import Engine, Window
 from torchelev.stages.measure.config import BodyConfig
@@ -144,8 +145,8 @@ def _from_z(axis: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def costmap(engine: Engine, min_traversability: float, robot_height: float | None = None) -> OccupancyGrid:
     """Return the costs of the map at Nav2's scale, for a robot of a height [m]: `to_occupancy_grid`."""
-    window, rating, levels = engine.window(), engine.layer("traversability"), engine.levels
-    low = None if levels is None else levels.is_too_low(engine.layer("clearance"), robot_height)
+    window, rating, needed = engine.window(), engine.layer("traversability"), needed_height(engine.levels, robot_height)
+    low = None if engine.levels is None else is_too_low(engine.layer("clearance"), needed)
     return occupancy_of(rating, window.corner, window.resolution, min_traversability, low)
 
 

@@ -91,7 +91,7 @@ class Publishers:
 
     def _make_costmap(self) -> OccupancyGrid:
         settings = self._node.settings
-        grid = outputs.costmap(self._node.engine, settings.min_traversability, settings.robot_height)
+        grid = outputs.costmap(self._node.engine, settings.min_traversability, settings.robot_height or None)
         return messages.to_occupancy_grid(grid, self._header())
 
     def _make_scan(self) -> Float32MultiArray | None:

@@ -20,9 +20,10 @@ from torchelev.diagnosis.causes import diagnose
 from torchelev.elevation_map import ElevationMap
 from torchelev.errors import require
 from torchelev.io.map_file import load_map, save_map
+from torchelev.levels.config import levels_with_ceilings
 from torchelev.observations.height_scan import HeightScan
 from torchelev.observations.scan.presets import PRESETS
-from torchelev.ros2.engine import PathAnswer, SensorInput, Window, levels_with_ceilings
+from torchelev.ros2.engine import PathAnswer, SensorInput, Window
 from torchelev.ros2.settings import NodeSettings
 from torchelev.state import map_layers
 

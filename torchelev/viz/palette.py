@@ -1,4 +1,4 @@
-"""Colours of all figures and pages, told apart by colour-blind readers. matplotlib is not needed here."""
+"""Colours of all figures and pages, which colour-blind readers can tell apart."""
 
 UNKNOWN_COLOR = "#d9d9d9"  #: cells without a value
 HEIGHTS = "viridis"  #: colour map of heights [m]

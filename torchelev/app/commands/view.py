@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -34,17 +33,18 @@ the cell that is clicked. Ctrl-C closes it.
 def _run_view(recording: Path | None, host: str, port: int, paused: bool, **options: Any) -> None:
     """Run `torchelev view`; its help text is `_VIEW_HELP`."""
     request = None if recording is None else MapRequest(recording=recording, **options)
-    with user_errors(), ExitStack() as closing:
+    with user_errors():
         server = open_server("demo" if recording is None else recording.resolve().name, host, port)
-        closing.callback(stop_server, server)
-        if recording is None or recording.exists():  # else all that follows is an error
-            click.echo(f"open      {address_of(server)}   (Ctrl-C ends)")
         try:
+            if recording is None or recording.exists():  # else all that follows is an error
+                click.echo(f"open      {address_of(server)}   (Ctrl-C ends)")
             from torchelev.app.view_command import run_view  # imports torch, while browsers load the page
 
             run_view(request, server, paused)
         except KeyboardInterrupt:
             click.echo("closed")
+        finally:
+            stop_server(server)
 
 
 _OUTPUTS = ("recording", "out", "grid_map", "video", "every")  # parameters of `map` that `view` lacks

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from torchelev.elevation_map import ElevationMap
-from torchelev.errors import require
-from torchelev.levels.config import ROUNDING
+from torchelev.levels.config import is_too_low, needed_height
 from torchelev.planning.polygons import PolygonCells
 from torchelev.planning.terrain.ground import read_patches
 from torchelev.state import MapState
@@ -29,37 +28,16 @@ def too_low(emap: ElevationMap, height: float | None, state: MapState | None = N
     Raises:
         ValueError: if a height is given for a map without levels.
     """
-    needed_height(emap, height)
+    needed = needed_height(emap.cfg.levels, height)
     if emap.levels is None:
         return None
-    assert emap.cfg.levels is not None
     clearance, known = emap.read_layer("clearance", state)
-    return known & emap.cfg.levels.is_too_low(clearance, height)
-
-
-def needed_height(emap: ElevationMap, height: float | None) -> float:
-    """Return the clearance [m] that the robot needs below ceilings: its height, and at least `min_gap`.
-
-    The map treats a smaller gap as solid, whether or not it was seen. 0 of a map without levels.
-
-    Args:
-        emap: the maps.
-        height: of the robot [m]; None: `min_gap` of the levels.
-
-    Raises:
-        ValueError: if a height is given for a map without levels.
-    """
-    if emap.levels is None:
-        hint = "give the map levels=LevelsConfig(), or leave it out"
-        require(height is None, "height", "needs a map with levels, which knows ceilings", height, hint)
-        return 0.0
-    assert emap.cfg.levels is not None
-    return emap.cfg.levels.needed_height(height)
+    return known & is_too_low(clearance, needed)
 
 
 def describe_ceiling(ceiling: float, needed: float) -> list[str]:
     """Return a sentence if a ceiling [m] above the ground is lower than it must be."""
-    is_low = ceiling < needed - ROUNDING
+    is_low = is_too_low(ceiling, needed)
     return [f"what hangs {ceiling:.2f} m above the ground is lower than the robot's {needed:.2f} m"] if is_low else []
 
 
